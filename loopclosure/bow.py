@@ -27,9 +27,7 @@ from vslam.map_kernels import count_shared
 
 
 class BowDetector:
-    """A ``LoopDetector`` that compares images using bags of visual words. Keyframes must be added
-    in ascending order of their ids.
-    """
+    """A ``LoopDetector`` that compares images using bags of visual words."""
 
     name = "bow"
 
@@ -47,7 +45,7 @@ class BowDetector:
         """Store the visual words of a keyframe. The image is ignored.
 
         Raises:
-            ValueError: the id is not greater than the ids of all earlier keyframes.
+            ValueError: the id of the keyframe is not greater than the ids of all earlier keyframes.
         """
         if keyframe < self._n_keyframes:
             raise ValueError(
@@ -60,10 +58,8 @@ class BowDetector:
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
         """Find candidates for a keyframe that has been added.
 
-        Candidates are keyframes in the map that are neither recent nor covisible with the query,
-        which is the given keyframe. The scores of candidates are at least the lowest score among
-        the keyframes that are covisible with the query. If no keyframe is covisible with the query,
-        there is no lower limit.
+        Keyframes that are recent or covisible with the given keyframe are excluded. The score of a
+        candidate is at least the lowest score among the covisible keyframes.
         """
         config = self.config
         entries = self._entries(keyframe)
@@ -81,16 +77,12 @@ class BowDetector:
     def locate(
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
-        """Return the keyframes in the map that look similar to a frame outside the map, most
-        similar first."""
         words = self.vocabulary.words(features.descriptors)
         likeness = self._index.compare(bow_vector(self.vocabulary, words))
         eligible = map_.arrays.keyframe_alive[: len(likeness.score)].copy()
         return self._candidates(-1, likeness, eligible, 0.0, map_)
 
     def memory(self) -> DetectorMemory:
-        """Return the visual words of all keyframes, to be saved in a map file (see
-        :class:`LoopDetector`)."""
         first = self._start[: self._n_keyframes + 1]
         words = PerKeyframe(first, self._word[: first[-1]])
         return DetectorMemory(self.name, self._fingerprint, {"words": words})
@@ -156,13 +148,15 @@ class BowDetector:
 
 @inner_kernel
 def most_covisible(counts, minimum, keyframes, strength):
-    """Select the keyframes that share the most landmarks with a keyframe. ``counts`` gives the
-    number of landmarks that each other keyframe shares with this keyframe. Counts below ``minimum``
-    are ignored.
+    """Select the G keyframes with the highest counts. Counts below ``minimum`` are ignored.
 
-    Up to G keyframes are selected. Their ids are written into ``keyframes`` and their counts into
-    ``strength``, both ``(G,)`` int64. The selected keyframes are sorted by descending count and
-    then by ascending id. Returns the number of selected keyframes.
+    Args:
+        counts: ``(n,)`` number of landmarks that each keyframe shares with a given keyframe.
+        keyframes, strength: ``(G,)`` int64, receive the ids and the counts of the selected
+            keyframes. The highest count comes first. If counts are equal, the lower id comes first.
+
+    Returns:
+        Number of selected keyframes, at most G.
     """
     n = 0
     for k in range(len(counts)):
@@ -197,11 +191,11 @@ def choose_candidates(
     1. A keyframe passes if it shares enough words with the query: at least ``common_words_ratio``
        times as many as the keyframe that shares the most. Of the keyframes that pass and score at
        least ``least_score``, the ``max_groups`` keyframes with the highest scores are selected.
-    2. Each selected keyframe forms a group with its ``group_size`` most covisible keyframes, if
-       these pass. The score of a group is the sum of the scores of its members. The representative
-       of a group is the member with the highest score.
-    3. The representatives of the best groups are returned. The score of such a group is at least
-       ``group_score_ratio`` times the highest score of a group.
+    2. Each selected keyframe forms a group with those of its ``group_size`` most covisible
+       keyframes that pass. The score of a group is the sum of the scores of its members. The
+       representative of a group is the member with the highest score.
+    3. A group is kept if its score is at least ``group_score_ratio`` times the highest score of a
+       group. The representatives of these groups are returned.
 
     Args:
         a, n_keyframes: arrays of the map, and number of keyframes in the map.

@@ -1,10 +1,11 @@
 """Inverted index from visual words to keyframes (Galvez-Lopez and Tardos, T-RO 2012, section IV).
 
+The index stores one entry, called a posting, for each word of each keyframe. A posting contains the
+id of the keyframe and the weight of the word in the keyframe.
+
 The L1 score of two bags of words is a sum over their shared words. Each shared word contributes the
-smaller of its two weights (vocabulary.py). A posting is an entry of the index for a word and a
-keyframe that contains the word. It stores the weight of the word in the keyframe. A single pass
-over the postings of a query's words then gives the number of shared words and the score of every
-keyframe.
+smaller of its two weights. Therefore, a single pass over the postings of the query's words gives
+the scores of all keyframes.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ SHARED = 1 << 40  # added for each shared word; larger than any sum of weights
 
 
 def grown(array: NDArray, needed: int) -> NDArray:
-    """Return an array with room for at least ``needed`` items. The given array is returned if it is
-    long enough. Otherwise, a copy with at least 1.5 times the length is returned."""
+    """Return an array with room for at least ``needed`` items: the given array if it is long
+    enough, or else a longer copy."""
     if needed <= len(array):
         return array
     bigger = np.empty((max(needed, len(array) * 3 // 2), *array.shape[1:]), array.dtype)
@@ -45,12 +46,11 @@ class Likeness(NamedTuple):
 
 
 class Postings(NamedTuple):
-    """Inverted index of W words. A posting records that a keyframe contains a word. The postings of
-    a word are contiguous in memory, in one block.
+    """Inverted index of W words. A posting records that a keyframe contains a word.
 
-    The size of a block is 8, 16, 32 or another power of two. When the block of a word is full, its
-    postings are moved to a block of twice the size. The old block can then be reused for other
-    words.
+    The postings of a word lie in one block of memory. The size of a block is 8, 16, 32 or a higher
+    power of two. When the block of a word is full, its postings are moved to a block of twice the
+    size. The old block can then be reused for other words.
 
     Attributes:
         start: ``(W,)`` index of the first posting of each word.
@@ -67,8 +67,8 @@ class Postings(NamedTuple):
 
 
 class InvertedIndex:
-    """An inverted index: it stores the keyframes that contain each visual word, and the weight of
-    the word in each of these keyframes."""
+    """Stores which keyframes contain each visual word, and the weight of each word in each
+    keyframe."""
 
     def __init__(self, n_words: int) -> None:
         self.n_keyframes = 0  # newest id + 1
@@ -81,7 +81,6 @@ class InvertedIndex:
         self._used = 0  # entries of the pool that are in blocks
 
     def add(self, keyframe: int, bag: BowVector) -> None:
-        """Add the bag of words of a keyframe that has not been added before."""
         size = self._postings.size[bag.words].astype(np.int64)
         growing = np.where(size == 0, FIRST_BLOCK, 2 * size)[is_full(size)]
         pool = grown(self._postings.pool, self._used + int(growing.sum()))
@@ -90,8 +89,7 @@ class InvertedIndex:
         self.n_keyframes = max(self.n_keyframes, keyframe + 1)
 
     def compare(self, bag: BowVector) -> Likeness:
-        """Compare the bag of words of an image with the bags of all keyframes, from id 0 to the
-        newest id."""
+        """Compare an image with all keyframes, from id 0 to the newest id."""
         sums = compare_with_all(self._postings, self.n_keyframes, bag.words, fixed(bag.weights))
         return Likeness((sums // SHARED).astype(np.int32), sums % SHARED / UNIT)
 
@@ -116,6 +114,8 @@ def post(postings, used, keyframe, words, weights):
     The pool must have room for one new block for each word whose block is full.
 
     Args:
+        words: ``(n,)`` int32 words.
+        weights: ``(n,)`` int64 weights of the words, in units of 1 / ``UNIT``.
         used: number of entries of the pool that belong to blocks.
 
     Returns:
@@ -149,11 +149,16 @@ def post(postings, used, keyframe, words, weights):
 
 @kernel
 def compare_with_all(postings, n_keyframes, words, weights):
-    """Compare the bag of words of an image with the bags of all keyframes. Returns ``(K,)`` int64:
-    for each keyframe, the number of shared words times ``SHARED``, plus the score. The score is the
-    sum of the smaller weight of each shared word.
+    """Compare the bag of words of an image with the bags of all keyframes.
 
-    Both quantities are stored in one integer, so that each posting needs only one addition.
+    Args:
+        words: ``(n,)`` int32 words.
+        weights: ``(n,)`` int64 weights of the words, in units of 1 / ``UNIT``.
+
+    Returns:
+        ``(K,)`` int64: for each keyframe, the number of shared words times ``SHARED``, plus the sum
+        of the smaller weight of each shared word. Both quantities are stored in one integer, so
+        that each posting needs only one addition.
     """
     start, sizes, _, pool = postings
     sums = np.zeros(n_keyframes, np.int64)

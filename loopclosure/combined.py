@@ -18,11 +18,12 @@ class CombinedDetector:
     """A :class:`vslam.loopclosure.detector.LoopDetector` that merges the candidates of several
     detectors.
 
-    The scores of different detectors are not comparable, so the candidates of all detectors are
-    interleaved. The best candidate of each detector comes first, then the second best of each, and
-    so on. Candidates for the same keyframe are joined. Several keyframes of the same place may all
-    remain candidates. The reason is that after a change in lighting, only one of these keyframes
-    may be recognisable.
+    The scores of different detectors are not comparable. Therefore, the best candidate of each
+    detector comes first, then the second best of each, and so on. Two candidates for the same
+    keyframe become one.
+
+    Several keyframes of the same place may all remain candidates, because after a change in
+    lighting, only one of these keyframes may be recognisable.
     """
 
     def __init__(self, name: str, detectors: list[LoopDetector]) -> None:
@@ -42,9 +43,6 @@ class CombinedDetector:
         return _interleaved([one.locate(image, features, map_) for one in self._detectors])
 
     def memory(self) -> DetectorMemory:
-        """Return the data that all detectors have stored, to be saved in a map file (see
-        :class:`LoopDetector`). The data of each detector is stored under the name of the
-        detector."""
         memories = [one.memory() for one in self._detectors]
         tables = {
             f"{memory.name}/{name}": table
@@ -63,8 +61,7 @@ class CombinedDetector:
 
 
 def _interleaved(found: list[list[LoopCandidate]]) -> list[LoopCandidate]:
-    """Interleave the candidates of several detectors: the first candidate of each detector, then
-    the second of each, and so on. Candidates for the same keyframe are joined into one."""
+    """Return the first candidate of each detector, then the second of each, and so on."""
     by_match: dict[int, LoopCandidate] = {}
     for candidate in chain.from_iterable(zip_longest(*found)):
         if candidate is not None:
@@ -74,11 +71,8 @@ def _interleaved(found: list[list[LoopCandidate]]) -> list[LoopCandidate]:
 
 
 def _joined(first: LoopCandidate, second: LoopCandidate) -> LoopCandidate:
-    """Join the candidates of two detectors for the same keyframe.
-
-    The result is the first candidate, with the names of both detectors. If the first candidate has
-    no ``similarity``, the similarity of the second candidate is used.
-    """
+    """Combine two candidates for the same keyframe. The result has the score of the first
+    candidate."""
     similarity = second.similarity if first.similarity is None else first.similarity
     names = f"{first.proposed_by}+{second.proposed_by}"
     return replace(first, similarity=similarity, proposed_by=names)

@@ -27,8 +27,7 @@ from vslam.states import ConsistencyState
 
 
 class LoopConsistency:
-    """Tests the temporal consistency of loops. For this test, the places that recent keyframes
-    resembled and the loops that were verified for these keyframes are stored.
+    """Tests the temporal consistency of loops.
 
     Call ``update`` once for every keyframe, even if the keyframe has no candidates. Call
     ``confirm`` for every loop edge that was verified. Call ``reset`` after a loop has been closed.
@@ -46,13 +45,10 @@ class LoopConsistency:
         """Check whether enough consecutive keyframes resembled the place of each candidate.
 
         The place of a candidate consists of its match and the keyframes that are covisible with the
-        match. The candidate continues the longest series of keyframes that resembled an overlapping
-        place. Candidates at the same place share one series, so there are never more new series
-        than candidates.
+        match. Two places are considered the same if they share a keyframe.
 
         Returns:
-            The candidates whose place enough consecutive keyframes resembled, and a rejected loop
-            edge for each other candidate.
+            The candidates that pass, and a rejected loop edge for each other candidate.
         """
         self._turn += 1
         series: dict[frozenset[int], ResembledPlace] = {}
@@ -90,9 +86,10 @@ class LoopConsistency:
         compared with the tolerances. True loops therefore imply the same drift, and false loops do
         not.
 
+        A keyframe counts only once, even if several of its loop edges agree.
+
         Returns:
-            The loop edge. The edge is marked as not accepted if the loops of too few keyframes have
-            agreed so far. A keyframe counts only once, even if several of its loop edges agree.
+            The loop edge. It is marked as not accepted if the loops of too few keyframes agree.
         """
         if not edge.accepted:
             return edge
@@ -113,13 +110,14 @@ class LoopConsistency:
     def confirmed_by_earlier(
         self, map_: Map, camera: Camera, config: VerificationConfig
     ) -> Iterator[LoopEdge]:
-        """Yield verified loops that are confirmed by an earlier keyframe. So far, the loops of too
-        few keyframes have agreed with these loops. The newest loop comes first.
+        """Some verified loops wait because too few other loops agree with them. Yield those that an
+        earlier keyframe confirms, newest first.
 
-        An earlier keyframe confirms a loop if it meets three conditions. It is covisible with the
-        query of the loop. It can be verified at the same place as the query. The two loops imply
-        the same drift. ORB-SLAM3 (section VI) also tries covisible keyframes before it waits for
-        later keyframes.
+        An earlier keyframe confirms a loop if three conditions are met. The keyframe is covisible
+        with the query of the loop. The keyframe can be verified at the same place as the query.
+        Both loops imply the same drift.
+
+        ORB-SLAM3 (section VI) also tries covisible keyframes before it waits for later keyframes.
         """
         oldest = self._turn + 1 - self.config.verified_memory
         for waiting in [edge for turn, edge in reversed(self._verified) if turn >= oldest]:
@@ -132,9 +130,6 @@ class LoopConsistency:
     def _is_confirmed(
         self, edge: LoopEdge, map_: Map, camera: Camera, config: VerificationConfig
     ) -> bool:
-        """Return whether another keyframe can be verified at the place of a loop edge, with the
-        same drift. This keyframe must be covisible with the query of the edge, and at least
-        ``min_moved`` away from the query."""
         assert edge.T_query_match is not None
         T_w_query = inverse(map_.keyframe_pose(edge.query))
         for keyframe in map_.covisible(edge.query)[0].tolist():
@@ -162,25 +157,22 @@ class LoopConsistency:
         )
 
     def state(self) -> ConsistencyState:
-        """Return the state, to store it in a map file or a checkpoint."""
         return ConsistencyState(tuple(self._series), tuple(self._verified), self._turn)
 
     def restore(self, state: ConsistencyState) -> None:
-        """Restore a state that the method ``state`` returned."""
         self._series, self._verified = list(state.places), list(state.verified)
         self._turn = state.turn
 
     def reset(self) -> None:
-        """Discard the places and verified loops of all recent keyframes. This is necessary after a
-        loop has been closed, because the map has moved."""
+        """Discard everything that was stored about recent keyframes. This is necessary after a loop
+        has been closed, because the map has moved."""
         self._series.clear()
         self._verified.clear()
 
 
 def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:
-    """Compute the drift that a loop edge implies: the ``(4, 4)`` motion of the world that moves the
-    query to where the edge places it. If the edge has a scale, the motion is a similarity with the
-    scale in its upper left 3x3 block.
+    """Compute the ``(4, 4)`` motion of the world that moves the query keyframe to where a loop edge
+    places it. The motion is a similarity if the edge has a scale.
 
     Raises:
         ValueError: the edge has no pose.
@@ -193,7 +185,7 @@ def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:
 
 
 def _rigid(S: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Set the scale of a similarity to 1. A rigid motion is returned unchanged."""
+    """Set the scale of a similarity to 1. A rigid motion keeps its exact values."""
     T, scale_cubed = S.copy(), np.linalg.det(S[:3, :3])
     if abs(scale_cubed - 1.0) > 1e-9:
         T[:3, :3] /= np.cbrt(scale_cubed)

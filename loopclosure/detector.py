@@ -18,16 +18,13 @@ class LoopDetector(Protocol):
 
     The methods are called in the order of the keyframes, by one thread at a time.
 
-    All detectors share the later stages: rating and verification of candidates, consistency, and
-    correction. However, the descriptors that are used to verify candidates depend on the detector.
-    The setting ``verification.descriptors`` selects these descriptors. The default of this setting
-    depends on the detector.
+    The setting ``verification.descriptors`` selects the descriptors that verify candidates. Its
+    default depends on the detector. For ``bow``, ``capsule-paper`` and plug-ins, the default is
+    ``orb``. For the other detectors, the default is ``both``: candidates that fail the verification
+    with ORB descriptors are verified again using learned local descriptors. The 20 most similar
+    keyframes are also ranked using local descriptors.
 
-    For ``bow``, ``capsule-paper`` and plug-ins, candidates are verified using only ORB descriptors.
-    For ``both`` and the other networks, candidates that fail this verification are verified again
-    using learned local descriptors. These detectors also use the local descriptors to rank the 20
-    most similar keyframes. The local descriptors always come from the feature extractor of the
-    capsule network, regardless of the network that proposed the candidates.
+    The local descriptors always come from the feature extractor of the capsule network.
 
     To compare detectors in isolation, set ``verification.descriptors`` to the same value for all
     detectors, either ``orb`` or ``both``.
@@ -36,13 +33,17 @@ class LoopDetector(Protocol):
     name: str
 
     def add(self, keyframe: int, image: NDArray[np.uint8] | None, features: Features) -> None:
-        """Store the appearance of a keyframe. ``image`` is the ``(H, W)`` uint8 left image of the
-        keyframe, or None if the image was not stored."""
+        """Store the appearance of a keyframe.
+
+        Args:
+            image: ``(H, W)`` uint8 left image, or None if the image was not stored.
+        """
         ...
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
         """Find candidates for a keyframe that has been added, best first. Candidates are similar
-        keyframes in the map that are neither recent nor covisible with the keyframe."""
+        keyframes in the map. Recent keyframes and keyframes that are covisible with the given
+        keyframe are excluded."""
         ...
 
     def locate(
@@ -59,7 +60,7 @@ class LoopDetector(Protocol):
 
     def restore(self, memory: DetectorMemory) -> None:
         """Load the data that the method ``memory`` of an identical detector returned. This replaces
-        calling ``add`` for each keyframe.
+        the calls of ``add`` for the keyframes in the data.
 
         Raises:
             ValueError: the data is damaged or comes from a different detector.
@@ -71,12 +72,11 @@ def require_same(detector: DetectorMemory, memory: DetectorMemory) -> None:
     """Check that stored data comes from the same detector, with the same vocabulary or weights.
 
     Args:
-        detector: what the method ``memory`` of the detector returns.
+        detector: the result of the detector's method ``memory``.
         memory: the stored data.
 
     Raises:
-        ValueError: the data comes from a different detector, or from the same detector with a
-            different vocabulary or different weights.
+        ValueError: the detector, its vocabulary or its weights differ.
     """
     if memory.name != detector.name:
         raise ValueError(f"made with the detector {memory.name}, not {detector.name}")

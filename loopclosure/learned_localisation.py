@@ -2,7 +2,8 @@
 
 Landmarks of the place are searched for everywhere in the image, not only at its keypoints. The
 reason is that at night or in a different lane, the corner detector finds different points. If one
-keyframe of the place does not give enough matches, the matches of further keyframes are added.
+keyframe of the place does not give enough matches, further keyframes of the place are matched as
+well.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from vslam.reprojection import stack_uvr
 
 
 class View(NamedTuple):
-    """The local descriptors and the landmarks of one keyframe of a place.
+    """The local descriptors and the landmarks of one keyframe.
 
     Attributes:
         maps: local descriptors of the keyframe's image.
@@ -44,14 +45,12 @@ class View(NamedTuple):
 
 
 class PoseEstimate(NamedTuple):
-    """A camera pose that was estimated at a place, and the landmarks of the place that should be
-    visible from this pose.
+    """An estimated camera pose at a place, and the landmarks that should be visible from there.
 
     Attributes:
         landmarks: ``(M,)`` int32 ids of the landmarks that should be visible.
         uv: ``(M, 2)`` float64 predicted positions of these landmarks in the image, pixels.
-        seen: ``(M,)`` bool, True for inliers: landmarks that were found at their predicted
-            positions.
+        seen: ``(M,)`` bool, True for landmarks that were found at their predicted positions.
         n_matches: number of landmarks that were matched near their predicted positions, including
             outliers.
         T_cw: ``(4, 4)`` pose of the camera (world to camera), in the world frame of the landmarks.
@@ -117,7 +116,6 @@ def localise(
 
 
 def view_of(map_: Map, keyframe: int, images: KeyframeImages) -> View:
-    """Create the ``View`` of a keyframe whose image is stored."""
     a, rows = map_.arrays, map_.rows(keyframe)
     landmark = a.landmark[rows]
     observing = np.flatnonzero(landmark >= 0)
@@ -132,10 +130,8 @@ def guided_search(
     camera: Camera,
     config: LearnedMatchingConfig,
 ) -> PoseEstimate:
-    """Refine the pose of an image. All landmarks that the keyframes ``views`` observe are searched
-    for near their projections, and the pose is optimised with all matches. Both steps are done
-    twice.
-    """
+    """Refine the pose of an image. The landmarks of ``views`` are searched for near their
+    projections, and the pose is optimised with all matches. Both steps are done twice."""
     _, first = np.unique(np.concatenate([view.landmarks for view in views]), return_index=True)
     landmarks = np.concatenate([view.landmarks for view in views])[first]
     xyz = map_.arrays.xyz[landmarks]
@@ -175,7 +171,10 @@ def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
 def _observed(
     uv: Matrix, query: DescriptorMaps, config: LearnedMatchingConfig
 ) -> tuple[Matrix, Matrix]:
-    """Convert ``(N, 2)`` pixels to monocular observations: ``(N, 3)`` u, v, u_right, where u_right
-    is NaN, and ``(N,)`` inverse variances of u and v."""
+    """Convert ``(N, 2)`` pixels to monocular observations.
+
+    Returns:
+        ``(N, 3)`` u, v, u_right, where u_right is NaN, and ``(N,)`` inverse variances of u and v.
+    """
     sigma = config.sigma / query.scale
     return stack_uvr(uv, np.full(len(uv), np.nan)), np.full(len(uv), sigma**-2.0)

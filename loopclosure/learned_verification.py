@@ -2,9 +2,7 @@
 
 Learned descriptors still match when the appearance has changed too much for ORB descriptors.
 
-The steps are the same as in :mod:`vslam.loopclosure.verification`. First, an initial pose is
-estimated. Then, guided matching uses all landmarks of the place, and the pose is refined. Finally,
-the same tests as with ORB descriptors reject places that only look similar.
+The steps and the tests are the same as in :mod:`vslam.loopclosure.verification`.
 """
 
 from __future__ import annotations
@@ -37,15 +35,12 @@ _DEPTHS_AGREE = 0.15  # largest relative difference in depth between two landmar
 
 
 class LearnedTrials:
-    """Chooses which loop candidates are verified. Learned local descriptors verify them.
+    """Chooses the loop candidates for which verification with learned local descriptors is tried.
 
-    Verification with learned descriptors takes forty times as long as verification with ORB
-    descriptors, so only a few candidates are tried.
-
-    The local descriptors give a similarity of each candidate to the query. The candidates with the
-    highest similarities are chosen if their similarities exceed a limit. After a failed attempt,
-    the limit is higher for the next ``learned.retry_interval`` keyframes. During this time, only
-    candidates that are clearly more similar than the failed candidate are chosen.
+    This verification takes forty times as long as verification with ORB descriptors. Therefore,
+    only the candidates that are most similar to the query are tried, and only if their similarity
+    exceeds a limit. After a failed attempt, the limit is higher for the next
+    ``learned.retry_interval`` keyframes.
 
     Attributes:
         state: the result of the last attempt.
@@ -87,8 +82,7 @@ def with_similarities(
     config: LearnedMatchingConfig,
     beyond: NDArray[np.float64] | None = None,
 ) -> list[LoopCandidate]:
-    """Compute the ``similarity`` of candidates using local descriptors, unless the detector has
-    already done this.
+    """Compute the ``similarity`` of candidates that do not have one yet, using local descriptors.
 
     Args:
         candidates: the loop candidates, best first. At most ``config.max_compared`` candidates are
@@ -119,13 +113,11 @@ def with_similarities(
 def is_image_redundant(
     map_: Map, keyframe: int, images: KeyframeImages, config: LearnedMatchingConfig
 ) -> bool:
-    """Return whether the image of a keyframe need not be stored, because another stored image shows
-    nearly the same view.
+    """Return whether the image of a keyframe need not be stored.
 
-    There are two such cases. In the first case, the image of the previous keyframe is stored. Every
-    second image is enough, even if keyframes are far apart. In the second case, any keyframe whose
-    image is stored shares most landmarks with this keyframe. This happens when the camera moves
-    slowly, turns, or revisits a mapped place.
+    An image is redundant if the image of the previous keyframe is stored. It is also redundant if a
+    keyframe whose image is stored shares most landmarks with this keyframe. This happens when the
+    camera moves slowly, turns, or revisits a mapped place.
     """
     if keyframe - 1 in images:
         return True
@@ -146,8 +138,8 @@ def verify_learned(
     using ORB descriptors.
 
     Returns:
-        The loop edge. It is either accepted, or it contains the reason why it was rejected. Its
-        features and landmarks are the inliers that coincide with a keypoint of the query.
+        The loop edge, either accepted or rejected with a reason. Its features and landmarks are the
+        inliers that coincide with a keypoint of the query.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate, matched_by="learned")
@@ -205,8 +197,8 @@ def recognise(
         match: id of the keyframe.
 
     Returns:
-        The pose and the observed landmarks. The result is None if the frame fails the tests that a
-        loop must pass, or if too few of its keypoints coincide with landmarks to continue tracking.
+        The pose and the observed landmarks. None if the frame fails the tests that a loop must
+        pass, or if too few of its keypoints coincide with landmarks to continue tracking.
     """
     gates = config.verification
     around = [match, *map_.covisible(match)[0].tolist()]
@@ -226,8 +218,8 @@ def recognise(
 def observed_features(
     map_: Map, query: int, estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pair features of the query image with landmarks of a place whose predicted image positions
-    coincide with the features.
+    """Pair features of the query image with landmarks at the same image position. The image
+    positions of landmarks are predicted from the estimated pose.
 
     If a feature already observes a landmark, the depths of both landmarks must agree. Otherwise, a
     corner of a car could be paired with a corner of the facade behind the car.
@@ -252,7 +244,7 @@ def joined(
     first: tuple[NDArray[np.int32], NDArray[np.int32]],
     second: tuple[NDArray[np.int32], NDArray[np.int32]],
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Join two lists of pairs of features and landmarks. A pair of the second list is added only if
+    """Join two lists of pairs (feature, landmark). A pair of the second list is added only if
     neither its feature nor its landmark is in the first list."""
     new = ~(np.isin(second[0], first[0]) | np.isin(second[1], first[1]))
     return np.r_[first[0], second[0][new]], np.r_[first[1], second[1][new]]
@@ -270,7 +262,7 @@ def nearest_features(
 
     Args:
         uv: ``(N, 2)`` positions in the image, pixels.
-        xy, octave: positions and octaves of the features of the image.
+        xy, octave: ``(F, 2)`` positions in pixels and ``(F,)`` octaves of the features.
 
     Returns:
         ``(K,)`` indices of features, without duplicates, and ``(K,)`` indices of the matched
@@ -299,12 +291,8 @@ def _rejection_reason(
     config: LearnedMatchingConfig,
     gates: VerificationConfig,
 ) -> str:
-    """Test a loop after its pose was refined. Returns the reason to reject the loop, or "" if the
-    loop passes all tests.
-
-    Args:
-        query_seen: the two numbers that ``_seen_of_query`` returned.
-    """
+    """Return the reason to reject a loop, or "" if it passes all tests. ``query_seen`` is the
+    result of ``_seen_of_query``."""
     assert edge.T_query_match is not None
     distance = float(np.linalg.norm(inverse(edge.T_query_match)[:3, 3]))
     if distance > gates.max_distance:
@@ -320,8 +308,7 @@ def _rejection_reason(
 def _visibility_reason(
     estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig, gates: VerificationConfig
 ) -> str:
-    """Test whether enough landmarks of the place were found in the image. Returns the reason to
-    reject the pose, or "" if enough landmarks were found."""
+    """Return the reason to reject a pose, or "" if enough landmarks were found in the image."""
     seen, total = int(np.count_nonzero(estimate.seen)), len(estimate.seen)
     if seen < config.min_inliers:
         return f"only {seen} learned matches fit"
@@ -342,13 +329,8 @@ def _seen_of_query(
     camera: Camera,
     config: LearnedMatchingConfig,
 ) -> tuple[int, int]:
-    """Count the landmarks of the query keyframe that are visible in the image of a keyframe of the
-    place.
-
-    Returns:
-        Number of landmarks of the query that are found at their projections in this image, and
-        number of landmarks of the query that should be visible in it.
-    """
+    """Return how many landmarks of the query are found at their projections in the image of a
+    keyframe, and how many should be visible in this image."""
     assert edge.T_query_match is not None
     T_match_query = inverse(edge.T_query_match)
     T_match_query[:3, 3] *= edge.scale  # in the unit around the query, like the landmarks
@@ -380,8 +362,6 @@ class LearnedRelocalisation:
     def __call__(
         self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
     ) -> Localisation | None:
-        """Estimate the pose of a frame at the candidate keyframes whose images are most similar to
-        the image of the frame. Returns None if this fails at all candidates."""
         images, config = self._images, self._config
         if images is None or image is None:
             return None

@@ -1,11 +1,10 @@
 """Coarse-to-fine matching of learned local descriptors, as in LoFTR (Sun et al., CVPR 2021).
 
 Each image is divided into cells, and each cell has a descriptor. A coarse match is a pair of cells
-in two images whose descriptors are mutual nearest neighbours. Fine matching searches the second
-image for each keypoint of the first image. The search windows lie around the positions that nearby
-coarse matches predict. The second image needs no keypoints. The position that is found is refined
-to a fraction of a cell. A position is accepted only if the reverse search, from the second to the
-first image, returns to the keypoint.
+in two images whose descriptors are mutual nearest neighbours. Coarse matches predict where each
+keypoint of the first image lies in the second image. Fine matching searches around these
+predictions, and refines the result to a fraction of a cell. A position is accepted only if the
+reverse search, from the second to the first image, returns to the keypoint.
 """
 
 from __future__ import annotations
@@ -37,8 +36,7 @@ class DescriptorMaps(NamedTuple):
     scale: float
 
     def coarse_alone(self) -> DescriptorMaps:
-        """Return a copy that contains only the coarse descriptors, in half precision. These
-        descriptors stay in memory for all keyframes, and half precision saves memory."""
+        """Return a copy with only the coarse descriptors, in half precision to save memory."""
         none = np.empty((0, *self.fine.shape[1:]), np.float32)
         return self._replace(coarse=self.coarse.astype(np.float16), fine=none)
 
@@ -57,12 +55,6 @@ class CoarseMatches(NamedTuple):
 
 
 class Located(NamedTuple):
-    """Positions of keypoints of one image in another image.
-
-    Attributes:
-        xy: ``(N, 2)`` float64 pixels of the camera image; NaN for keypoints that were not found.
-    """
-
     xy: NDArray[np.float64]
 
     @property
@@ -72,8 +64,8 @@ class Located(NamedTuple):
 
 
 def match_coarse(a: DescriptorMaps, b: DescriptorMaps, least: float) -> CoarseMatches:
-    """Find pairs of coarse cells whose descriptors are mutual nearest neighbours. Their cosine
-    similarity must be at least ``least``."""
+    """Find pairs of coarse cells whose descriptors are mutual nearest neighbours and have a cosine
+    similarity of at least ``least``."""
     cells = [one.coarse.reshape(-1, one.coarse.shape[2]).astype(np.float32) for one in (a, b)]
     best_a, best_b, similarity = _nearest(cells[0], np.ascontiguousarray(cells[1].T))
     mutual = (best_b[best_a] == np.arange(len(best_a))) & (similarity >= least)
@@ -96,14 +88,13 @@ def locate(
     reach: int,
     least: float,
 ) -> Located:
-    """Search image b for the keypoints of image a. The search windows lie around the positions that
-    nearby coarse matches predict.
+    """Search image b for the keypoints of image a, near the positions that coarse matches predict.
 
     Args:
         xy: ``(N, 2)`` keypoints, in pixels of camera image a.
         coarse: coarse matches from a to b.
-        reach: half width of a window, in fine cells.
-        least: least cosine similarity of a match.
+        reach: half width of the search window, in fine cells.
+        least: lowest accepted cosine similarity.
     """
     rows, columns, _ = a.coarse.shape
     cell_in_b = np.full(rows * columns, -1, np.int64)
@@ -123,13 +114,14 @@ def locate_near(
     reach: int,
     least: float,
 ) -> Located:
-    """Search image b for the keypoints of image a, in windows around the given predicted positions.
+    """Search image b for the keypoints of image a, in windows around given positions.
 
     Args:
         xy: ``(N, 2)`` keypoints, in pixels of camera image a.
-        expected: ``(N, 2)`` predicted positions, in pixels of camera image b. A keypoint with NaN
-            is skipped.
-        reach, least: see ``locate``.
+        expected: ``(N, 2)`` predicted positions, in pixels of camera image b. A keypoint whose
+            predicted position is NaN is skipped.
+        reach: half width of the search window, in fine cells.
+        least: lowest accepted cosine similarity.
     """
     found = _locate_near(
         xy.astype(np.float64) * (a.scale / FINE_STRIDE),
@@ -144,10 +136,8 @@ def likeness(a: DescriptorMaps, b: DescriptorMaps, least: float) -> float:
     images.
 
     The similarity is the sum of the cosine similarities of the coarse matches, divided by the
-    number of cells of the smaller image.
-
-    Args:
-        least: least cosine similarity of a match.
+    number of cells of the smaller image. Matches with a cosine similarity below ``least`` are
+    ignored.
     """
     return float(match_coarse(a, b, least).similarity.sum() / _fewest_cells(a, b))
 
@@ -177,14 +167,15 @@ def homography_inliers(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMa
 
 
 def _fewest_cells(a: DescriptorMaps, b: DescriptorMaps) -> int:
-    """Return the number of coarse cells of the smaller image."""
     return min(one.coarse.shape[0] * one.coarse.shape[1] for one in (a, b))
 
 
 @kernel
 def _nearest(a, b):
-    """Find the nearest neighbours of two sets of descriptors by cosine similarity: a, with shape
-    ``(N, C)``, and b, with shape ``(C, M)``.
+    """Find the nearest neighbours of two sets of descriptors by cosine similarity.
+
+    Args:
+        a, b: ``(N, C)`` and ``(C, M)`` float32 descriptors of length 1.
 
     Returns:
         ``(N,)`` int64 index of the nearest b for each a; ``(M,)`` int64 index of the nearest a for
@@ -211,12 +202,8 @@ def _nearest(a, b):
 
 @inner_kernel
 def _interpolate(fine, x, y, out):
-    """Interpolate the descriptor at (x, y), and write it into ``out``. Returns False if the
-    position is outside the image.
-
-    The position is given in cells. The descriptor is interpolated bilinearly and normalised to
-    length 1.
-    """
+    """Interpolate the descriptor at the cell coordinates (x, y) bilinearly, normalise it to length
+    1, and write it into ``out``. Returns False if the position is outside the image."""
     rows, columns, channels = fine.shape
     if not (x >= 0.0 and y >= 0.0 and x <= columns - 1 and y <= rows - 1):
         return False
@@ -251,9 +238,8 @@ def _cosine(fine, i, j, descriptor):
 
 @inner_kernel
 def _search(fine, descriptor, x, y, reach):
-    """Find the cell within ``reach`` of (x, y) whose descriptor is most similar to the given
-    descriptor. Returns its column, row and cosine similarity. The similarity is -2 if the window is
-    outside the image."""
+    """Return the column, the row and the cosine similarity of the most similar cell within
+    ``reach`` of (x, y). The similarity is -2 if the window is outside the image."""
     rows, columns, _ = fine.shape
     best_i, best_j, best = -1, -1, np.float32(-2.0)
     middle_j, middle_i = int(np.rint(x)), int(np.rint(y))
@@ -267,9 +253,8 @@ def _search(fine, descriptor, x, y, reach):
 
 @inner_kernel
 def _peak(fine, descriptor, j, i, best):
-    """Refine the position of the best match to a fraction of a cell. In x and in y, the refined
-    position is the maximum of a parabola. The parabola passes through the cosine similarities of
-    the best cell and its two neighbours."""
+    """Refine the position of the best match to a fraction of a cell. In x and in y, a parabola is
+    fitted to the similarities of the best cell and its two neighbours."""
     rows, columns, _ = fine.shape
     x, y = float(j), float(i)
     if 0 < j < columns - 1:
@@ -287,9 +272,12 @@ def _peak(fine, descriptor, j, i, best):
 
 @inner_kernel
 def _accept_if_mutual(fine_a, fine_b, descriptor, x, y, j, i, best, reach, other, found):
-    """Refine the position of the best cell in b, and write it into ``found`` if the reverse search
-    confirms it. The reverse search from this position must end within 1.5 cells of the keypoint at
-    ``(x, y)`` in a. ``other`` is a workspace."""
+    """Write the refined position of the best cell in b into ``found`` if the reverse search
+    confirms it.
+
+    The reverse search must end within 1.5 cells of the keypoint at ``(x, y)`` in a. ``other`` is a
+    workspace for a descriptor.
+    """
     peak_x, peak_y = _peak(fine_b, descriptor, j, i, best)
     if _interpolate(fine_b, peak_x, peak_y, other):
         back_j, back_i, _ = _search(fine_a, other, x, y, reach)

@@ -23,9 +23,8 @@ _METHODS = ("add", "query", "locate")
 
 
 class PlugInDetector:
-    """A ``LoopDetector`` that forwards all calls to the detector of another package.
-
-    After that detector has failed once, it is not called again.
+    """A ``LoopDetector`` that forwards all calls to the detector of another package. After that
+    detector has failed once, it is not called again.
 
     Attributes:
         problem: one sentence about the failure; None if there was no failure. A run ends after a
@@ -50,9 +49,8 @@ class PlugInDetector:
         return self._candidates(-1, map_, self._detector.locate, _read_only(image), features, map_)
 
     def memory(self) -> DetectorMemory:
-        """Return the data that the other package's detector has stored for all keyframes, to be
-        saved in a map file. If that detector has no method ``memory``, the result contains only the
-        name of the detector."""
+        """Return the data of the other package's detector. If that detector has no method
+        ``memory``, the result contains only the name of the detector."""
         empty = DetectorMemory(self.name)
         if not callable(getattr(self._detector, "memory", None)):
             return empty
@@ -68,11 +66,11 @@ class PlugInDetector:
         return replace(memory, name=self.name)
 
     def restore(self, memory: DetectorMemory) -> None:
-        """Load the data that the method ``memory`` returned (see ``LoopDetector``).
+        """Load the data that the method ``memory`` returned.
 
         Raises:
             ValueError: the data comes from a different detector, or the other package's detector
-                has no method ``restore``, or this method fails.
+                cannot restore it.
         """
         if memory.name != self.name:
             raise ValueError(f"made with the detector {memory.name}, not {self.name}")
@@ -85,8 +83,8 @@ class PlugInDetector:
             raise ValueError(self.problem)
 
     def _call(self, method: Callable[..., Any], *arguments: object) -> Any:
-        """Call a method of the other package's detector and return its result. Returns None if the
-        detector fails, or if it has failed in an earlier call."""
+        """Call a method of the other package's detector. Returns None if that detector fails or has
+        failed before."""
         if self.problem is not None:
             return None
         try:
@@ -108,7 +106,7 @@ class PlugInDetector:
 
 
 def open_plugin(plugin: PlugIn, config: Config, weights: Path | None) -> PlugInDetector:
-    """Create the detector of a plug-in, without any keyframes.
+    """Create an empty loop detector from a plug-in.
 
     Raises:
         InputError: the package is broken, or the object that it creates is not a detector.
@@ -124,8 +122,8 @@ def open_plugin(plugin: PlugIn, config: Config, weights: Path | None) -> PlugInD
 
 
 def _fault(candidates: object, query: int, map_: Map) -> str:
-    """Describe what is wrong with the candidates that the other package's detector returned for a
-    query. Returns "" if the candidates are valid.
+    """Describe what is wrong with the candidates that a plug-in returned, or return "" if they are
+    valid.
 
     The check is needed because compiled kernels use the ids as indices without bounds checks.
     """

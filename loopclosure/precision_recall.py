@@ -1,7 +1,6 @@
 """Computes precision, recall and derived measures from the scores of a loop detector.
 
-The measures are defined as in published benchmarks. An example is recall at 100 % precision
-(Cummins and Newman, IJRR 2008). Tests check that the curves are identical to those of scikit-learn.
+Tests check that the curves are identical to those of scikit-learn.
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ from vslam.errors import InputError
 
 @dataclass(frozen=True)
 class PrecisionRecall:
-    """A precision-recall curve of K + 1 points.
+    """A precision-recall curve.
 
-    There is one point for each of K thresholds on the score. An additional last point has precision
-    1 and recall 0.
+    There is one point for each of K thresholds on the score. The last point has precision 1 and
+    recall 0, and belongs to no threshold.
 
     Attributes:
         precision, recall: ``(K + 1,)`` float64.
@@ -76,33 +75,30 @@ def curve_of(right: NDArray[np.bool_], score: NDArray[np.float64], total: int) -
 
 
 def average_precision(curve: PrecisionRecall) -> float:
-    """Compute the average precision. It is the sum of the precisions, weighted by the steps in
-    recall, without interpolation."""
+    """Compute the sum of the precisions, weighted by the steps in recall, without interpolation."""
     return float(-np.sum(np.diff(curve.recall) * curve.precision[:-1]))
 
 
 def recall_at_full_precision(curve: PrecisionRecall) -> float:
-    """Return the highest recall at which all accepted pairs are correct."""
+    """Return the highest recall at which all accepted pairs are correct (Cummins and Newman, IJRR
+    2008)."""
     return float(curve.recall[curve.precision == 1.0].max())
 
 
 def precision_at_recall(curve: PrecisionRecall, recall: float) -> float:
-    """Return the highest precision that any threshold gives at the given recall or a higher
-    recall."""
+    """Return the highest precision at the given recall or a higher recall."""
     return float(curve.precision[curve.recall >= recall].max())
 
 
 def accepted_at(curve: PrecisionRecall, threshold: float) -> tuple[float, float]:
-    """Return the precision and the recall at a threshold on the score. If no pair is
-    accepted, the precision is defined as 1, and the recall is 0.
-    """
+    """Return the precision and the recall at a threshold. If no pair is accepted, the precision is
+    1."""
     k = int(np.searchsorted(curve.thresholds, threshold))
     return float(curve.precision[k]), float(curve.recall[k])
 
 
 def max_f1(curve: PrecisionRecall) -> tuple[float, float]:
-    """Return the highest F1 score (harmonic mean of precision and recall), and the threshold that
-    gives it."""
+    """Return the highest F1 score (harmonic mean of precision and recall) and its threshold."""
     p, r = curve.precision[:-1], curve.recall[:-1]
     f1 = np.divide(2 * p * r, p + r, out=np.zeros_like(p), where=p + r > 0)
     best = int(np.argmax(f1))
@@ -110,10 +106,8 @@ def max_f1(curve: PrecisionRecall) -> tuple[float, float]:
 
 
 def balanced_accuracy(same: NDArray, score: NDArray, threshold: float) -> float:
-    """Compute the balanced accuracy at a threshold on the score. It is the mean of the true
-    positive rate and the true negative rate.
-
-    It equals the accuracy on a set with as many positive as negative pairs.
+    """Compute the mean of the true positive rate and the true negative rate at a threshold on the
+    score.
 
     Args:
         same: ``(N,)`` bool, True for pairs of images that show the same place.
@@ -132,8 +126,12 @@ def balanced_accuracy(same: NDArray, score: NDArray, threshold: float) -> float:
 
 
 def summary(same: NDArray, score: NDArray) -> dict[str, float]:
-    """Compute all measures that a report shows for a loop detector, from its scores on a set of
-    image pairs."""
+    """Compute all measures that a report shows for a loop detector.
+
+    Args:
+        same: ``(N,)`` bool, True for pairs of images that show the same place.
+        score: ``(N,)`` similarity of each pair.
+    """
     curve = precision_recall(same, score)
     f1, threshold = max_f1(curve)
     return {

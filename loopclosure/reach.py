@@ -15,16 +15,15 @@ def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.
 
     The result is the distance between the camera and each keyframe, minus a bound on the position
     error of odometry. The bound is a constant plus a fraction of the distance travelled since the
-    keyframe. A monocular map has no metric scale, and its scale drifts. In a monocular map, the
-    bound is therefore a larger fraction of the distance travelled, with no constant term.
+    keyframe. In a monocular map, whose scale is unknown and drifts, the bound is a larger fraction
+    without the constant.
 
-    Keyframes of other sub-maps are always within reach. The camera was lost between the sub-maps,
-    so their relative pose is unknown. In a monocular map, their relative scale is unknown as well.
+    Keyframes of other sub-maps are always within reach, because their pose relative to the camera
+    is unknown.
 
-    Within a sub-map, a keyframe whose viewing direction differs too much from that of the camera is
-    out of reach at any distance. There are two reasons. The heading from odometry is accurate to a
-    few degrees. In addition, the detectors do not recognise a place that is seen from behind or
-    from the side.
+    A keyframe of the same sub-map is out of reach if its viewing direction differs too much from
+    that of the camera. The heading from odometry is accurate to a few degrees, and the detectors do
+    not recognise a place from behind or from the side.
 
     Args:
         keyframe: id of the current keyframe.

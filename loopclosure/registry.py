@@ -38,11 +38,9 @@ def about(name: str) -> str:
 
 
 def require_detector(name: str, weights: Path | None = None, option: str = "--detector") -> None:
-    """Check that a loop detector can be created. This check is done before anything expensive is
-    imported or compiled.
+    """Check that a loop detector can be created, before anything expensive is imported or compiled.
 
     Args:
-        name: name of the detector.
         weights: weights or vocabulary of the detector; None uses the files that vslam ships.
         option: the command-line option that error messages refer to.
 
@@ -84,19 +82,22 @@ def detector_with_images(
     late: bool = True,
 ) -> tuple[LoopDetector, KeyframeImages | None]:
     """Create a loop detector, and the store of keyframe images for verification with learned
-    descriptors. Both are empty, and :class:`vslam.slam.Slam` takes both.
+    descriptors. Both are empty. :class:`vslam.slam.Slam` takes both.
 
     Args:
-        weights, late: see :func:`create_detector`.
+        weights: weights of a learned detector, or the vocabulary of ``bow``; None uses the file
+            that vslam ships.
         local_weights: weights of the local-descriptor network; None uses the weights that vslam
             ships.
+        late: whether loading of the shipped network is postponed until the first image.
 
     Returns:
         The detector, and the store of images. The store is None if candidates are verified using
         only ORB descriptors.
 
     Raises:
-        InputError, ValueError: see :func:`create_detector`.
+        InputError: the vocabulary or weights cannot be read, or the package of a plug-in is broken.
+        ValueError: there is no such detector.
     """
     images = create_images(name, config, local_weights)
     return create_detector(name, config, weights, images, late=late), images
@@ -110,8 +111,8 @@ def create_detector(
     *,
     late: bool = False,
 ) -> LoopDetector:
-    """Create a loop detector without any keyframes. The dependencies of the detector are imported
-    only when this function is called.
+    """Create an empty loop detector. Its dependencies are imported only when this function is
+    called.
 
     Args:
         weights: weights of a learned detector, or the vocabulary of ``bow``; None uses the file
@@ -154,9 +155,8 @@ def create_detector(
 
 
 def create_images(name: str, config: Config, weights: Path | None = None) -> KeyframeImages | None:
-    """Create the store of keyframe images. The images are needed to rate and verify loop candidates
-    using learned descriptors. Returns None if ``verification.descriptors`` selects only ORB
-    descriptors.
+    """Create the store of keyframe images, which is needed to rate and verify loop candidates using
+    learned descriptors. Returns None if only ORB descriptors are used.
 
     Raises:
         InputError: the local-descriptor network cannot be read.
@@ -176,8 +176,6 @@ def create_images(name: str, config: Config, weights: Path | None = None) -> Key
 
 
 def _network_of(name: str) -> str:
-    """Return the name of the network that a learned detector uses. The detector ``both`` uses the
-    network ``capsule``."""
     return "capsule" if name == "both" else name
 
 

@@ -1,9 +1,8 @@
 """Estimates the motion between two cameras from matched 3D landmarks using RANSAC.
 
-On both sides of a loop, the map contains landmarks of the same points. Three matches of such
-landmarks determine the motion in closed form (Horn, JOSA A 1987; the scale is computed as in
-Umeyama, PAMI 1991). As in ORB-SLAM (T-RO 2015, section VII-B), RANSAC scores a motion by the
-reprojection errors in *both* keyframes.
+Three matches of landmarks determine the motion in closed form (Horn, JOSA A 1987; the scale is
+computed as in Umeyama, PAMI 1991). As in ORB-SLAM (T-RO 2015, section VII-B), RANSAC scores a
+motion by the reprojection errors in both keyframes.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ MIN_FLATNESS = 0.03
 
 
 class ObservedPoints(NamedTuple):
-    """The landmarks of N matches on one side of a loop, and their observations on this side.
+    """The landmarks of N matches on one side of a loop, and their observations in the keyframe.
 
     Attributes:
         points: ``(N, 3)`` landmarks in the camera frame, in the unit of the map.
@@ -72,10 +71,9 @@ def align(
         a, b: the landmarks of the same N matches, as observed by camera a and by camera b.
         intrinsics: ``(6,)`` of both cameras, see ``Camera.intrinsics``.
         seed: seed of the random samples; the same seed gives the same result.
-        min_inliers: least number of inliers.
         max_draws: maximum number of samples.
-        confidence: a probability. Assume that a better motion exists. Sampling ends when such a
-            motion would have been found with this probability.
+        confidence: probability with which a better motion, if there is one, is found before
+            sampling ends.
         fix_scale: whether the scale is fixed to 1. True for metric maps (stereo, RGB-D), False for
             monocular maps.
     """
@@ -174,8 +172,7 @@ def fit_motion(p_a, p_b, weights, fix_scale):
 
 @kernel
 def is_degenerate(p):
-    """Return whether three points are nearly collinear or coincide. The points are the rows of the
-    ``(3, 3)`` array ``p``."""
+    """Return whether three points, the rows of the ``(3, 3)`` array ``p``, are nearly collinear."""
     longest = 0.0
     for i in range(3):
         side = 0.0
@@ -194,8 +191,8 @@ def is_degenerate(p):
 @inner_kernel
 def _same_sides(p_a, p_b, bf):
     """Return whether the side lengths of two triangles agree within the error of stereo depths.
-
-    This fast test rejects most samples that contain a wrong match.
+    Both triangles are ``(3, 3)``, one point per row. This fast test rejects most samples that
+    contain a wrong match.
 
     A disparity error of one pixel moves a point by z^2 / bf. Both ends of a side may have this
     error in both cameras.
@@ -246,11 +243,12 @@ def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
     """Refine a motion by Gauss-Newton on the reprojection errors in both cameras, with the Huber
     loss.
 
-    The refinement is needed because stereo points are ten times less certain along the line of
-    sight than across it. ``fit_motion`` ignores this difference.
+    ``fit_motion`` weights all directions equally, but stereo points are ten times less certain
+    along the line of sight than across it.
 
     Args:
-        T, scale: initial ``(4, 4)`` motion and scale.
+        T, scale: initial ``(4, 4)`` motion and scale. ``T`` is overwritten.
+        a, b: ``ObservedPoints`` of both cameras.
         chosen: ``(M,)`` indices of the matches that are used.
 
     Returns:
@@ -299,9 +297,8 @@ def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
 
 @inner_kernel
 def _derivative(p, fix_scale, out):
-    """Compute the derivative of a moved point, ``[I, -[p]x, p]``, and write it into the ``(3, 7)``
-    array ``out``. The derivative is with respect to translation, rotation and the logarithm of the
-    scale."""
+    """Write the derivative of a moved point, ``[I, -[p]x, p]``, into the ``(3, 7)`` array ``out``.
+    The columns are translation, rotation and the logarithm of the scale."""
     for row in range(3):
         for column in range(3):
             out[row, column] = 1.0 if row == column else 0.0
@@ -326,8 +323,8 @@ def _error(x, y, z, uvr, inverse_sigma2, intrinsics):
 def _score_motion(T, scale, a, b, intrinsics, to_beat, inlier):
     """Compute the MSAC score of a motion (Torr and Zisserman, CVIU 2000) and its number of inliers.
 
-    The inliers are written into ``inlier``. As soon as the score can no longer exceed ``to_beat``,
-    the function stops and returns (-1, 0).
+    The inliers are written into ``inlier``, ``(N,)`` bool. As soon as the score can no longer
+    exceed ``to_beat``, the function stops and returns (-1, 0).
     """
     points_a, uvr_a, weight_a = a
     points_b, uvr_b, weight_b = b
@@ -360,7 +357,11 @@ def _score_motion(T, scale, a, b, intrinsics, to_beat, inlier):
 @kernel
 def _ransac(a, b, intrinsics, seed, min_inliers, max_draws, confidence, fix_scale):
     """Run RANSAC on samples of three matches. Each motion with a new best score is refitted to its
-    inliers. Returns the rigid motion T, the scale, the inliers, and the number of inliers."""
+    inliers.
+
+    Returns:
+        The ``(4, 4)`` rigid motion, the scale, the ``(N,)`` bool inliers, and their number.
+    """
     points_a, points_b = a.points, b.points
     n = len(points_a)
     state = np.empty(1, np.uint64)

@@ -7,10 +7,8 @@ section III-D). The descriptors of two keyframes are matched, and a motion is es
 Then all landmarks of the place are matched near their projections, and the pose is refined.
 
 ORB-SLAM then only counts inliers. However, two different facades or cars that look alike also give
-many inliers. The tests in this module therefore also look for evidence against the loop. There are
-two such tests. First, the inliers must be spread over the image. Second, the landmarks on each side
-of the loop are projected into the keyframe on the other side. Most of the landmarks that should be
-visible in that keyframe must be found.
+many inliers. This module therefore adds two tests. The inliers must be spread over the image. In
+addition, most landmarks of one keyframe must be found at their projections in the other keyframe.
 """
 
 from __future__ import annotations
@@ -50,8 +48,8 @@ class GuidedMatches(NamedTuple):
 
     Attributes:
         landmarks: ``(M,)`` int32 ids of the landmarks that should be visible.
-        feature: ``(M,)`` int32 index, within the keyframe, of the feature that matches each
-            landmark and is an inlier; -1 if there is no such feature.
+        feature: ``(M,)`` int32 index, within the keyframe, of the inlier feature that matches each
+            landmark; -1 if there is no such feature.
         uv: ``(M, 2)`` float64 predicted positions of the landmarks in the image, pixels.
         n_matches: number of landmarks that were matched near their predicted positions, including
             outliers.
@@ -81,9 +79,8 @@ def verify(
 
     Returns:
         A loop edge. It is accepted with the reason "verified", or rejected with a different reason.
-        The pose and the numbers of matches and inliers come from the last step that was completed.
-        Each inlier is a pair of a feature of the query keyframe and a landmark of the place. There
-        are no duplicates.
+        Its pose and counts come from the last step that was completed. Its inliers are pairs of a
+        feature of the query keyframe and a landmark of the place, without duplicates.
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate)
@@ -102,8 +99,8 @@ def verify(
 
 
 def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationConfig) -> LoopEdge:
-    """Verify a loop edge that already has a pose. The function does the same as ``verify``, but it
-    starts from the pose of the edge instead of matching descriptors.
+    """Verify a loop edge that already has a pose. In contrast to ``verify``, descriptors are
+    matched only near the projections of landmarks.
 
     Raises:
         ValueError: the edge has no pose.
@@ -133,11 +130,11 @@ def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationC
 def match_keyframes(
     map_: Map, query: int, match: int, config: VerificationConfig
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Match the descriptors of two keyframes. Only features that observe landmarks are used.
+    """Match the descriptors of two keyframes. Features without a landmark are not used.
 
     Returns:
-        Two ``(N,)`` arrays, one for each keyframe. Entry i of an array refers to the keyframe's
-        feature of match i, as a row of the map's observation arrays.
+        Two ``(N,)`` arrays of row indices into the observation arrays of the map. The first array
+        belongs to the query, and the second array to the match.
     """
     a = map_.arrays
     rows_q, rows_m = (
@@ -161,8 +158,12 @@ def _consensus(
     camera: Camera,
     config: VerificationConfig,
 ) -> tuple[Matrix | None, float, int]:
-    """Estimate the motion between two keyframes using RANSAC. Returns ``T_query_match``, the scale
-    and the number of inliers. ``T_query_match`` is None if no motion has enough inliers."""
+    """Estimate the motion between two keyframes using RANSAC.
+
+    Returns:
+        ``T_query_match``, the scale and the number of inliers. ``T_query_match`` is None if no
+        motion has enough inliers.
+    """
     found = align(
         _observed_points(map_, query, rows_q),
         _observed_points(map_, match, rows_m),
@@ -181,17 +182,17 @@ def _consensus(
 
 
 def relative_scale(map_: Map, edge: LoopEdge, T_cw: Matrix, *, default: float) -> float:
-    """Estimate the scale of a monocular loop. It is the factor that converts lengths around the
-    match keyframe to lengths around the query keyframe.
+    """Estimate the scale of a monocular loop: the factor that converts lengths around the match
+    keyframe to lengths around the query keyframe.
 
-    An inlier feature of the query keyframe may also observe another landmark, which was mapped on
-    the query's side of the loop. The depth of this landmark, divided by the depth of the matched
+    An inlier feature of the query keyframe may also observe a landmark that was mapped on the
+    query's side of the loop. The depth of this landmark, divided by the depth of the matched
     landmark of the place, is one estimate of the scale. The median of these estimates is returned.
 
     Args:
         T_cw: ``(4, 4)`` pose of the query keyframe (world to camera), in the world frame of the
             place.
-        default: the result if there are too few features that observe landmarks on both sides.
+        default: the result if too few features observe landmarks on both sides.
     """
     a = map_.arrays
     assert edge.features is not None
@@ -212,18 +213,16 @@ def _observed_points(map_: Map, keyframe: int, rows: NDArray[np.int64]) -> Obser
 
 
 def _observations(map_: Map, rows: NDArray[np.int64]) -> tuple[Matrix, Matrix]:
-    """Read the ``(N, 3)`` u, v, u_right and the ``(N,)`` inverse variances of N features. ``rows``
-    is the ``(N,)`` rows of the features in the observation arrays of the map."""
+    """Read the ``(N, 3)`` u, v, u_right and the ``(N,)`` inverse variances of some rows of the
+    observation arrays."""
     a = map_.arrays
     uvr = stack_uvr(a.xy[rows], a.u_right[rows])
     return uvr, map_.scales[a.octave[rows]] ** -2.0
 
 
 def place_of(map_: Map, match: int, query: int, config: VerificationConfig) -> NDArray[np.int64]:
-    """Return the ids of the keyframes that form the place of a loop candidate: the match keyframe
-    and its most covisible keyframes. Keyframes that are covisible with the query keyframe are
-    excluded.
-    """
+    """Return the ids of the match keyframe and its most covisible keyframes. Keyframes that are
+    covisible with the query keyframe are excluded."""
     near_query = {query, *map_.covisible(query)[0].tolist()}
     around = [k for k in map_.covisible(match)[0].tolist() if k not in near_query]
     return np.array([match, *around[: config.place_keyframes]], np.int64)
@@ -292,8 +291,7 @@ def _rejection_reason(
     camera: Camera,
     config: VerificationConfig,
 ) -> str:
-    """Test a loop after its pose was refined. Returns the reason to reject the loop, or "" if the
-    loop passes all tests."""
+    """Return the reason to reject a loop, or "" if it passes all tests."""
     if edge.n_inliers < config.min_inliers:
         return f"only {edge.n_inliers} landmarks of the place fit"
     if edge.n_inliers < config.min_inlier_ratio * edge.n_matches:
@@ -321,15 +319,13 @@ def spread_reason(
     config: VerificationConfig,
     min_elsewhere: int,
 ) -> str:
-    """Test whether the inliers are spread over the image. Returns the reason to reject them, or ""
-    if they are spread.
+    """Return the reason to reject inliers that are not spread over the image, or "".
 
     Args:
         uv: ``(M, 2)`` predicted positions, in pixels, of the landmarks that should be visible.
         seen: ``(M,)`` bool, True for inliers.
-        min_elsewhere: least number of inliers outside a vertical strip of the image. The width of
-            the strip is a third of the width of the image. The strip is placed where it contains as
-            many inliers as possible.
+        min_elsewhere: least number of inliers outside any vertical strip with a third of the image
+            width.
     """
     expected, occupied = occupied_cells(uv, camera), occupied_cells(uv[seen], camera)
     if occupied < max(config.min_cells, config.min_cell_ratio * expected):
@@ -355,8 +351,8 @@ def reverse_match(
 
 
 def seen_of(map_: Map, keyframe: int, guided: GuidedMatches) -> tuple[int, int]:
-    """Count the landmarks of a keyframe that guided matching found, and the landmarks of the
-    keyframe that should be visible. Returns both numbers."""
+    """Return how many landmarks of a keyframe were found by guided matching, and how many of them
+    should be visible."""
     own = np.isin(guided.landmarks, map_.landmarks_of(keyframe))
     return int(np.count_nonzero(guided.seen & own)), int(np.count_nonzero(own))
 

@@ -2,9 +2,6 @@
 
 There are three verifiers. The first uses ORB descriptors. The second uses learned descriptors. The
 third uses ORB descriptors first, and learned descriptors if ORB descriptors fail.
-
-Loop closing uses only the interface of :class:`Verifier`. Therefore, loop closing is the same for
-all verifiers.
 """
 
 from __future__ import annotations
@@ -64,9 +61,8 @@ class Verifier:
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """Set the fields ``similarity`` and ``promising`` of a keyframe's candidates (see
-        ``LoopCandidate``), if this verifier uses these fields. The order of the candidates is not
-        changed."""
+        """Set the fields ``similarity`` and ``promising`` of a keyframe's candidates, if this
+        verifier uses these fields. The order of the candidates is not changed."""
         return candidates
 
     def verify(
@@ -76,8 +72,7 @@ class Verifier:
 
         Args:
             refusal: the rejected loop edge if the candidate has failed an earlier test, or else
-                None. Verification with ORB descriptors skips candidates that have failed an earlier
-                test.
+                None. Verification with ORB descriptors skips such a candidate.
 
         Returns:
             An accepted loop edge with a pose, or a rejected loop edge with the reason.
@@ -87,8 +82,8 @@ class Verifier:
         return verification.verify(map_, candidate, self._camera, self._config.verification)
 
     def state(self) -> VerifierState:
-        """Return the state of the verifier, to store it in a map file or a checkpoint. The state
-        does not include the images."""
+        """Return the state of the verifier without the images, to store it in a map file or a
+        checkpoint."""
         return VerifierState()
 
     def restore(self, state: VerifierState) -> None:
@@ -99,9 +94,8 @@ def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None =
     """Create the verifier that ``config.verification.descriptors`` selects.
 
     Args:
-        images: the store of keyframe images for learned verification, from
-            ``vslam.loopclosure.registry.create_images``. None selects verification with only ORB
-            descriptors, regardless of the configuration.
+        images: the store of keyframe images, from ``vslam.loopclosure.registry.create_images``.
+            None selects verification with only ORB descriptors, regardless of the configuration.
     """
     if images is None:
         return Verifier(config, camera)
@@ -113,10 +107,9 @@ def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None =
 class LearnedVerifier(Verifier):
     """A verifier that uses only learned local descriptors.
 
-    Verification with learned descriptors takes forty times as long as with ORB descriptors, so
     :class:`LearnedTrials` selects the promising candidates. A promising candidate is tried even if
-    only one keyframe resembled the place. The reason is that a camera that crosses a place at night
-    may get only one good view of the place.
+    only one keyframe resembled the place, because a camera that crosses a place at night may get
+    only one good view of the place.
     """
 
     images: KeyframeImages
@@ -140,9 +133,6 @@ class LearnedVerifier(Verifier):
     def rate(
         self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
     ) -> list[LoopCandidate]:
-        """Set the fields ``similarity`` and ``promising`` of a keyframe's candidates (see
-        ``LoopCandidate``). A similarity is computed only if the detector has not already done
-        this."""
         images, config = self.images, self._config
         if keyframe in images and any(one.similarity is None for one in candidates):
             beyond = beyond_reach(map_, keyframe, config.siamese)
@@ -156,8 +146,8 @@ class LearnedVerifier(Verifier):
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
-        """Decide whether a candidate is a loop (see :class:`Verifier`). Promising candidates are
-        tried even if they have failed an earlier test. Other candidates are never tried."""
+        """Decide whether a candidate is a loop. Promising candidates are tried even if they have
+        failed an earlier test. Other candidates are never tried."""
         if not candidate.promising:
             reason = "images not similar enough for learned verification"
             return refusal or LoopEdge.of(candidate, reason, matched_by="learned")
@@ -184,7 +174,5 @@ class OrbThenLearnedVerifier(LearnedVerifier):
     def verify(
         self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
     ) -> LoopEdge:
-        """Decide whether a candidate is a loop (see :class:`Verifier`). A promising candidate that
-        is rejected with ORB descriptors is verified again using learned descriptors."""
         edge = Verifier.verify(self, map_, candidate, refusal)
         return edge if edge.accepted else super().verify(map_, candidate, edge)

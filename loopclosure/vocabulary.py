@@ -63,7 +63,7 @@ class Vocabulary:
         return len(self.weight)
 
     def words(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
-        """Find the visual words of ``(M, 32)`` uint8 descriptors. Returns ``(M,)`` int32 words."""
+        """Find the ``(M,)`` int32 visual words of ``(M, 32)`` uint8 descriptors."""
         return descend(
             np.ascontiguousarray(descriptors).view(np.uint64),
             self.descriptors,
@@ -73,8 +73,8 @@ class Vocabulary:
         )
 
     def ancestors(self, level: int) -> NDArray[np.int32]:
-        """Find the ancestor of each word at a level of the tree. Returns ``(W,)`` int32 nodes. The
-        root is at level 0. A word above the level is its own ancestor."""
+        """Find the ancestor of each word at a level of the tree, as ``(W,)`` int32 nodes. The root
+        is at level 0. A word above the level is its own ancestor."""
         nodes = np.flatnonzero(self.word >= 0).astype(np.int32)
         while (deep := self.level[nodes] > level).any():
             nodes[deep] = self.parent[nodes[deep]]
@@ -82,7 +82,7 @@ class Vocabulary:
 
 
 class BowVector(NamedTuple):
-    """The bag of words of an image: its visual words and their weights.
+    """The bag of words of an image.
 
     Attributes:
         words: ``(N,)`` int32 words, in ascending order.
@@ -97,8 +97,7 @@ def bow_vector(vocabulary: Vocabulary, words: NDArray[np.int32]) -> BowVector:
     """Compute the bag of words of an image from the ``(M,)`` visual words of its features. The
     tf-idf weights are normalised to an L1 norm of 1 (Nister and Stewenius, section 4).
 
-    Words that occur in every training image have weight 0. These words carry no information and are
-    left out.
+    Words that occur in every training image have weight 0 and are left out.
     """
     unique, count = np.unique(words, return_counts=True)
     weights = count * vocabulary.weight[unique].astype(np.float64)
@@ -108,12 +107,11 @@ def bow_vector(vocabulary: Vocabulary, words: NDArray[np.int32]) -> BowVector:
 
 
 def score(a: BowVector, b: BowVector) -> float:
-    """Compute the L1 score of two images from their bags of words: 1 - |a - b| / 2, in [0, 1]
-    (Galvez-Lopez and Tardos, T-RO 2012, equation 2).
+    """Compute the L1 score of two bags of words: 1 - |a - b| / 2, in [0, 1] (Galvez-Lopez and
+    Tardos, T-RO 2012, equation 2).
 
-    The weights are positive and sum to 1. The score therefore equals a sum over the shared words,
-    in which each word contributes the smaller of its two weights (Nister and Stewenius, section 4,
-    equation 5, rearranged).
+    The weights are positive and sum to 1. Therefore, the score is the sum of the smaller weight of
+    each shared word (Nister and Stewenius, section 4, equation 5, rearranged).
     """
     _, in_a, in_b = np.intersect1d(a.words, b.words, assume_unique=True, return_indices=True)
     return float(np.minimum(a.weights[in_a], b.weights[in_b]).sum(dtype=np.float64))
@@ -205,10 +203,8 @@ def from_children(
 
 
 def save(vocabulary: Vocabulary, path: Path) -> None:
-    """Write a vocabulary as an npz file.
-
-    The file is not compressed. The bits of descriptors are nearly random and hardly compress, and
-    an uncompressed file loads faster.
+    """Write a vocabulary as an npz file. It is not compressed, because descriptors hardly compress
+    and an uncompressed file loads faster.
 
     Raises:
         ResultsError: the file cannot be written.

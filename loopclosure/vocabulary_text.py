@@ -1,9 +1,9 @@
 """Reads and writes vocabularies in DBoW2's text format, for example ORB-SLAM's ``ORBvoc.txt``.
 
-The first line is ``k L scoring weighting``. Each further line describes a node by numbers. These
-numbers are the number of its parent, a flag that is 1 for a leaf and 0 otherwise, the 32 bytes of
-its descriptor, and its weight. The weight of a leaf is the inverse document frequency. Nodes are
-numbered from 1, in the order of their lines. Node 0 is the root and has no line.
+The first line is ``k L scoring weighting``. Each further line describes a node by 35 numbers: the
+number of its parent, a flag that is 1 for a leaf and 0 otherwise, the 32 bytes of its descriptor,
+and its weight. The weight of a leaf is the inverse document frequency. Nodes are numbered from 1,
+in the order of their lines. Node 0 is the root and has no line.
 
 The reader accepts any order in which parents precede their children. The writer uses breadth-first
 order.
@@ -31,33 +31,32 @@ L1_NORM, TF_IDF = 0, 0  # DBoW2's codes for the scoring and the weighting of vsl
 
 
 def read_vocabulary(path: Path) -> Vocabulary:
-    """Read a vocabulary from a file. A file name that ends in .txt selects DBoW2's text format. A
-    file name that ends in .npz selects the format of vslam.
+    """Read a vocabulary. The name of the file must end in .txt (DBoW2's text format) or .npz (the
+    format of vslam).
 
     Raises:
-        InputError: the file name has any other extension, or the file cannot be read (see ``load``
-            and ``read_text``).
+        InputError: the name has any other extension, or the file cannot be read.
     """
     return read_text(path) if is_text(path) else load(path)
 
 
 def write_vocabulary(vocabulary: Vocabulary, path: Path) -> None:
-    """Write a vocabulary to a file. A file name that ends in .txt selects DBoW2's text format. A
-    file name that ends in .npz selects the format of vslam.
+    """Write a vocabulary. The name of the file must end in .txt (DBoW2's text format) or .npz (the
+    format of vslam).
 
     Raises:
-        InputError: the file name has any other extension.
+        InputError: the name has any other extension.
         ResultsError: the file cannot be written.
     """
     (write_text if is_text(path) else save)(vocabulary, path)
 
 
 def is_text(path: Path) -> bool:
-    """Return True if a file name ends in .txt, which selects DBoW2's text format. Return False if
-    the name ends in .npz, which selects the format of vslam.
+    """Return True for a file name that ends in .txt (DBoW2's text format), and False for .npz (the
+    format of vslam).
 
     Raises:
-        InputError: the name has neither extension.
+        InputError: the name has any other extension.
     """
     if path.suffix not in (".txt", ".npz"):
         raise InputError(
@@ -151,8 +150,7 @@ def _read_header(path: Path, header: bytes) -> tuple[int, int]:
 
 
 def _read_nodes(path: Path, lines: list[bytes]) -> NDArray[np.float64]:
-    """Parse the lines of nodes 1 to n as ``(n, 35)`` numbers, and check that the numbers are in
-    their valid ranges."""
+    """Parse and check the lines of nodes 1 to n. Returns ``(n, 35)`` numbers."""
 
     def refused(node: int, fault: str) -> InputError:
         return InputError(f"{path}: line {node + 1} {fault}; fetch or export it again.")
@@ -186,8 +184,6 @@ def _read_nodes(path: Path, lines: list[bytes]) -> NDArray[np.float64]:
 def _check_children(
     path: Path, parent: NDArray[np.int64], leaf: NDArray[np.bool_], branching: int
 ) -> None:
-    """Check the tree of a vocabulary: leaves must have no children, and other nodes must have 1 to
-    ``branching`` children."""
     n_children = np.bincount(parent[1:], minlength=len(parent))
     for wrong, fault in (
         (leaf & (n_children > 0), "is a leaf but has children"),
@@ -201,8 +197,8 @@ def _check_children(
 
 
 def _breadth_first(parent: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Sort the nodes of a tree in breadth-first order. Returns the sorted nodes, and the level of
-    each node. Siblings keep the order of their lines."""
+    """Return the nodes of a tree in breadth-first order, and the level of each of these nodes.
+    Siblings keep the order of their lines."""
     by_parent = np.argsort(parent, kind="stable")
     n_children = np.bincount(parent[1:], minlength=len(parent))
     first = 1 + np.cumsum(n_children) - n_children  # position of each first child in by_parent

@@ -5,8 +5,8 @@ is based on Nister and Stewenius (CVPR 2006). In each node, every descriptor is 
 nearest of k centres. Each centre then becomes the bitwise majority of its descriptors. Both steps
 are repeated until nothing changes.
 
-All arithmetic is on integers, and this module generates the random numbers itself. A seed therefore
-gives the same tree on every machine.
+All arithmetic is on integers, and this module generates the random numbers itself. Therefore, a
+seed gives the same tree on every machine.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def train(
 @inner_kernel
 def uniform(state):
     """Generate a random number in [0, 1) using splitmix64 (Steele et al., OOPSLA 2014). Returns the
-    number and the next state of the generator."""
+    number and the next state of the generator, uint64."""
     state = state + np.uint64(0x9E3779B97F4A7C15)
     z = state
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -91,16 +91,13 @@ def uniform(state):
 
 @inner_kernel
 def seed_centres(data, members, branching, state, nearest, centres):
-    """Choose the initial cluster centres: up to ``branching`` different members of a node that are
-    far from each other.
+    """Choose up to ``branching`` different members of a node as the initial cluster centres.
 
-    The method is the greedy variant of k-means++ (Arthur and Vassilvitskii, SODA 2007, section 7).
-    k-means++ draws a member with a probability proportional to its squared distance from the
-    nearest centre that was already chosen. For bit vectors, this squared distance is the Hamming
-    distance. The greedy variant draws ``TRIALS`` members, and chooses the member that minimises the
-    sum of these distances over all members.
+    The method is the greedy variant of k-means++ (Arthur and Vassilvitskii, SODA 2007, section 7),
+    with the Hamming distance as the squared distance of bit vectors.
 
     Args:
+        data: ``(M, 4)`` uint64 descriptors.
         members: ``(n,)`` indices of the members of the node in ``data``.
         nearest: ``(n,)`` int64 workspace.
         centres: ``(branching, 4)`` uint64, receives the centres.
@@ -143,9 +140,9 @@ def seed_centres(data, members, branching, state, nearest, centres):
 
 @inner_kernel
 def assign(data, members, centres, n_centres, label):
-    """Assign each member of a node to the nearest cluster centre. If several centres are equally
-    near, the first centre is chosen. Returns the number of members whose centre has changed.
-    """
+    """Write the nearest centre of each member of a node into ``label``, ``(n,)`` int64. If several
+    centres are equally near, the first centre is chosen. Returns the number of labels that have
+    changed."""
     changed = 0
     for i in range(len(members)):
         nearest, least = 0, 257
@@ -197,8 +194,7 @@ def split_level(data, order, starts, branching, stream, iterations):
     Args:
         data: ``(M, 4)`` uint64 descriptors.
         order: ``(M,)`` int64 indices into ``data``, grouped by node. The array is overwritten.
-        starts: ``(n + 1,)`` int64 start of the group of each node in ``order``. Descriptors in
-            leaves of upper levels do not belong to these groups.
+        starts: ``(n + 1,)`` int64 start of the group of each node in ``order``.
         stream: uint64 seed of the random numbers of this level.
 
     Returns:

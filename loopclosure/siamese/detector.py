@@ -25,13 +25,10 @@ class SiameseDetector:
     """A :class:`vslam.loopclosure.detector.LoopDetector` that compares images using the descriptors
     of a Siamese network.
 
-    If the images of keyframes are stored (``images``), descriptors are computed on demand. The
-    network computes the descriptor of a keyframe only when the camera comes within reach of the
-    keyframe (:func:`beyond_reach`), or when tracking is lost. On a drive that never returns to a
-    place, the network does not run at all.
-
-    The descriptors are the rows of a matrix, which grows by half when it is full. The matrix has no
-    columns until the network has computed the first descriptor.
+    If the images of keyframes are stored, descriptors are computed on demand. The network computes
+    the descriptor of a keyframe only when the camera comes within reach of the keyframe
+    (:func:`beyond_reach`), or when tracking is lost. On a drive that never returns to a place, the
+    network does not run at all.
     """
 
     def __init__(
@@ -41,15 +38,15 @@ class SiameseDetector:
         learned: LearnedMatchingConfig | None = None,
         images: KeyframeImages | None = None,
     ) -> None:
-        """Create a detector without any keyframes. It has the name of the network.
+        """Create an empty detector with the name of the network.
 
         Args:
             learned: thresholds for local descriptors; None uses the defaults.
             images: the store of keyframe images. With a store, candidates must reach the similarity
-                ``config.offered``. The most similar keyframes are then ranked again using local
+                ``config.offered``, and the most similar keyframes are ranked again using local
                 descriptors. The reason is that at night, the correct place is often among these
-                keyframes, but it is often not ranked first. Without a store (None), candidates must
-                reach ``config.threshold`` and are ranked by similarity.
+                keyframes but not ranked first. If it is None, candidates must reach
+                ``config.threshold``.
         """
         self.name = network.name
         self._network = network
@@ -70,9 +67,6 @@ class SiameseDetector:
             self._store_descriptor(keyframe, image)
 
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
-        """Find candidates for a keyframe that has been added, best first (see
-        :class:`LoopDetector`). The similarity of a candidate is at least a threshold. The threshold
-        depends on whether the images of keyframes are stored (see ``__init__``)."""
         if keyframe >= len(self._row) or not (self._described[keyframe] or self._stored(keyframe)):
             return []
         eligible = self._searchable(map_)
@@ -100,10 +94,8 @@ class SiameseDetector:
         self, image: NDArray[np.uint8] | None, features: Features, map_: Map
     ) -> list[LoopCandidate]:
         """Return the keyframes in the map that are most similar to a frame outside the map, best
-        first.
-
-        No threshold is applied, because relocalisation verifies all candidates geometrically.
-        """
+        first. No threshold is applied, because relocalisation verifies all candidates
+        geometrically."""
         if image is None:
             return []
         eligible = self._searchable(map_)
@@ -116,8 +108,7 @@ class SiameseDetector:
         return self._best(-1, p, rating, map_)
 
     def memory(self) -> DetectorMemory:
-        """Return the descriptors that have been computed so far, to be saved in a map file (see
-        :class:`LoopDetector`)."""
+        """Return the descriptors that have been computed so far, to be saved in a map file."""
         first = np.concatenate([[0], np.cumsum(self._described)]).astype(np.int64)
         table = PerKeyframe(first, self._descriptors[self._row[self._described]])
         return DetectorMemory(self.name, self._network.fingerprint, {"descriptors": table})
@@ -136,20 +127,18 @@ class SiameseDetector:
 
     @property
     def _described(self) -> NDArray[np.bool_]:
-        """Return ``(K,)`` bool, True for keyframes whose descriptor has been computed."""
+        """``(K,)`` bool, True for keyframes whose descriptor has been computed."""
         return self._row >= 0
 
     def _searchable(self, map_: Map) -> NDArray[np.bool_]:
-        """Return ``(n,)`` bool, True for keyframes in the map that can be compared. Their
-        descriptor has been computed, or their image is stored, so that the descriptor can be
-        computed."""
+        """Return ``(n,)`` bool, True for keyframes in the map whose descriptor or image is
+        stored."""
         n = min(map_.n_keyframes, len(self._row))
         able = self._described[:n].copy()
         able[[k for k in np.flatnonzero(~able).tolist() if self._stored(k)]] = True
         return able & map_.arrays.keyframe_alive[:n]
 
     def _stored(self, keyframe: int) -> bool:
-        """Return whether the image of a keyframe is stored."""
         return self._images is not None and keyframe in self._images
 
     def _without_descriptor(self, keyframes: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -157,7 +146,6 @@ class SiameseDetector:
         return np.flatnonzero(keyframes & ~self._described[: len(keyframes)])
 
     def _describe(self, keyframes: Iterable[int]) -> None:
-        """Compute the descriptors of the given keyframes, unless they already exist."""
         assert self._images is not None
         for keyframe in keyframes:
             if not self._described[keyframe]:
@@ -178,8 +166,8 @@ class SiameseDetector:
     def _similarities(
         self, descriptor: NDArray[np.float32], eligible: NDArray[np.bool_]
     ) -> NDArray[np.float32]:
-        """Compare a descriptor with the descriptors of the keyframes. Returns the ``(N,)``
-        similarity of each keyframe; it is -1 for keyframes that are not eligible."""
+        """Return the ``(N,)`` similarity of each keyframe to a descriptor; -1 for keyframes that
+        are not eligible."""
         p = np.full(len(eligible), -1.0, np.float32)
         rows = self._row[: len(eligible)][eligible]
         if len(rows):
@@ -192,9 +180,14 @@ class SiameseDetector:
         return p
 
     def _local_ratings(self, p: NDArray[np.float32], query: DescriptorMaps) -> NDArray[np.float32]:
-        """Compare the query with the most similar keyframes again, using local descriptors. ``p``
-        is the ``(N,)`` similarity of the image descriptors. Returns the ``(N,)`` similarity of the
-        local descriptors; it is -1 for keyframes that were not compared."""
+        """Compare the query with the most similar keyframes again, using local descriptors.
+
+        Args:
+            p: ``(N,)`` similarity of the image descriptor of each keyframe.
+
+        Returns:
+            ``(N,)`` similarity of the local descriptors; -1 for keyframes that were not compared.
+        """
         assert self._images is not None
         rating = np.full(len(p), -1.0, np.float32)
         for keyframe in np.argsort(-p, kind="stable")[: self._config.reranked].tolist():
@@ -210,8 +203,8 @@ class SiameseDetector:
         rating: NDArray[np.float32],
         map_: Map,
     ) -> list[LoopCandidate]:
-        """Choose the keyframes with the highest ratings as candidates. ``rating`` has shape
-        ``(N,)``, and is -1 for keyframes that cannot be candidates.
+        """Choose the keyframes with the highest ratings as candidates. The rating is -1 for
+        keyframes that cannot be candidates.
 
         Among several covisible keyframes, only the best one becomes a candidate. Otherwise,
         keyframes of the same place would displace candidates at other places.

@@ -25,9 +25,8 @@ def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[Image
     """Read a FAB-MAP collection, which is a folder of images and a ground-truth matrix.
 
     The matrix has one row for each image, or one row for each pair of images. In a pair, the left
-    image has an odd number and the right image has an even number. If there is one row for each
-    pair, the images of only one camera are used. If the folder has a file ``calibration.txt`` (fx
-    fy cx cy k1 k2 p1 p2 [k3] on one line), the images are undistorted.
+    image has an odd number and the right image has an even number. If the folder has a file
+    ``calibration.txt`` (fx fy cx cy k1 k2 p1 p2 [k3] on one line), the images are undistorted.
 
     Args:
         folder: folder of the images.

@@ -64,17 +64,13 @@ class ImageSource:
         return to_size(self.grey(index), size, fit)
 
     def grey(self, index: int) -> NDArray[np.uint8]:
-        """Read an image as ``(H, W)`` uint8. It is undistorted, but not resized.
-
-        Raises:
-            UnreadableImageError: the image is missing or damaged.
-        """
+        """Read an image as ``(H, W)`` uint8. It is undistorted, but not resized."""
         image = read_grey(self.images[index], self.names[index])
         return image if self.calibration is None else undistorted(image, self.calibration)
 
     def select(self, chosen: NDArray[np.int64]) -> ImageSource:
-        """Create a source that contains only the images with the ``(M,)`` indices ``chosen``, in
-        this order."""
+        """Return a source with only the images that have the ``(M,)`` indices ``chosen``, in this
+        order."""
         return replace(
             self,
             names=tuple(self.names[i] for i in chosen),
@@ -97,7 +93,7 @@ def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> N
 
 
 def images_in(folder: Path) -> list[Path]:
-    """List the image files of a folder, sorted by name. The list is empty if there is no such
+    """Return the image files of a folder, sorted by name. The list is empty if there is no such
     folder."""
     if not folder.is_dir():
         return []
@@ -113,9 +109,7 @@ def read_loop_matrix(path: Path) -> NDArray[np.bool_]:
     """Read a loop matrix as ``(N, N)`` bool. An element is True if its two images close a loop.
 
     The loop matrix is the largest square matrix of a ``.mat`` file. It may be dense or sparse, and
-    it may have any name. In the files of Oxford and Lip6, its name is ``truth``. In the files for
-    KITTI, it is the name of the sequence. Most matrices mark each pair once, in the row of the
-    later image.
+    may have any name. Most matrices mark each pair once, in the row of the later image.
 
     Raises:
         InputError: there is no such file, or the file contains no loop matrix.

@@ -39,8 +39,8 @@ def parse_size(text: str) -> Size:
 def to_size(image: NDArray[np.uint8], size: Size, fit: Fit = "squash") -> NDArray[np.uint8]:
     """Resize an ``(H, W)`` uint8 image to the height and width ``size``.
 
-    ``squash`` keeps the whole view but changes the aspect ratio. ``crop`` keeps the aspect ratio:
-    it cuts out the largest central rectangle with the aspect ratio of ``size``.
+    ``squash`` keeps the whole view but changes the aspect ratio. ``crop`` cuts out the largest
+    central rectangle with the aspect ratio of ``size``.
     """
     import cv2
 
@@ -80,15 +80,11 @@ def read_grey(source: Path | NDArray[np.uint8], name: str = "") -> NDArray[np.ui
 
 
 def turn_homography(width: int, height: int, degrees: float) -> NDArray[np.float64]:
-    """Compute the ``(3, 3)`` homography for a rotation of the camera to the right, without any
-    translation.
+    """Compute the ``(3, 3)`` homography that maps pixels of an image to pixels of the image that
+    the camera would take after a rotation to the right by ``degrees``.
 
-    The homography maps pixels of an image to pixels of the image that the camera would take after a
-    rotation by ``degrees``.
-
-    The horizontal field of view is assumed to be 80 degrees, which is common on cars. A rotation to
-    the right only scales vertical coordinates. Therefore, the homography is also valid for images
-    whose height was scaled.
+    The horizontal field of view is assumed to be 80 degrees, which is common on cars. The
+    homography is also valid for images whose height was scaled.
     """
     focal = width / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])

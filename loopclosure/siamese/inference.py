@@ -28,14 +28,11 @@ _FIX = "write one with 'vslam export onnx', or give another file"
 class OnnxNetwork:
     """A Siamese network, loaded from a file that ``vslam export onnx`` wrote.
 
-    The file contains two graphs. The first graph computes descriptors from images. The second graph
-    compares descriptors.
-
     Attributes:
         name: one of ``NETWORKS``.
         size: height and width of its input images.
         dimensions: length D of its descriptors.
-        fingerprint: hash of the file; see ``fingerprint_of``.
+        fingerprint: hash of the file.
         about: description of the training of the weights. Its entry ``parameters`` is the number of
             learned parameters.
     """
@@ -44,8 +41,8 @@ class OnnxNetwork:
         """Load the network from an ONNX file.
 
         Raises:
-            InputError: the file is missing, damaged or not a network of vslam. The error is also
-                raised if ONNX Runtime is not installed.
+            InputError: the file is missing, damaged or not a network of vslam, or ONNX Runtime is
+                not installed.
         """
         self._embedding = open_session(path, path, "image")
         metadata = self._embedding.get_modelmeta().custom_metadata_map
@@ -79,7 +76,7 @@ class OnnxNetwork:
     def compare(
         self, query: NDArray[np.float32], gallery: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Compare a query image with N gallery images by their descriptors ``(D,)`` and ``(N, D)``.
+        """Compare a query descriptor ``(D,)`` with N gallery descriptors ``(N, D)``.
 
         Returns:
             ``(N,)`` probabilities in (0, 1) that the query and each gallery image show the same
@@ -102,7 +99,8 @@ class LateNetwork:
     """
 
     def __init__(self, name: str) -> None:
-        """
+        """Check that the network can be loaded, without loading it.
+
         Args:
             name: one of ``NETWORKS``.
 
@@ -137,7 +135,7 @@ class LateNetwork:
 
 
 def fingerprint_of(path: Path) -> str:
-    """Return a hash of the contents of a file: the first 16 hexadecimal digits of its SHA-256."""
+    """Return the first 16 hexadecimal digits of the SHA-256 of a file."""
     return sha256(path.read_bytes()).hexdigest()[:16]
 
 
@@ -160,8 +158,8 @@ def open_network(name: str, weights: Path | None = None) -> OnnxNetwork:
 
 
 def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
-    """Open an ``onnxruntime.InferenceSession`` that uses one thread. With one thread, the results
-    do not depend on the number of cores.
+    """Open an ``onnxruntime.InferenceSession`` that uses one thread, so that the results do not
+    depend on the number of cores.
 
     Args:
         path: path of the file, for error messages.
@@ -171,7 +169,7 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
 
     Raises:
         InputError: the file cannot be read, does not contain such a graph, or needs too much time
-            or memory. The error is also raised if ONNX Runtime is not installed.
+            or memory, or ONNX Runtime is not installed.
     """
     try:
         import onnxruntime
@@ -200,8 +198,7 @@ def open_session(path: Path, model: Path | bytes, first_input: str) -> Any:
 
 
 def _check_limits(path: Path, file: bytes) -> None:
-    """Refuse a file whose graph needs too much time or memory (``onnx_limits``). This function is
-    called for files that vslam does not ship."""
+    """Refuse a file from an untrusted source whose graph needs too much time or memory."""
     try:
         from vslam.loopclosure.siamese.onnx_limits import check_graph
     except ImportError as error:

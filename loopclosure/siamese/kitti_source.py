@@ -52,8 +52,8 @@ def read_kitti(
             loop matrices also mark pairs of images that are 20 m or more apart.
 
     Raises:
-        InputError: the range contains no images, images have no poses, or ``near`` is out of range.
-            The error is also raised if the matrix or the times do not belong to the sequence.
+        InputError: the range contains no images, images have no poses, ``near`` is out of range, or
+            the matrix or the times do not belong to the sequence.
     """
     base = root if (root / "sequences").is_dir() else root / "dataset"
     folder = base / "sequences" / seq / "image_0"
@@ -96,8 +96,7 @@ def read_kitti(
 
 
 def _times(path: Path, number: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """Read the capture times of the images with the given numbers, in seconds. Returns None if
-    there is no file of times."""
+    """Read the capture times in seconds. Returns None if there is no file of times."""
     if not path.exists():
         return None
     times = read_table(path, (1,), "a time")[:, 0]
@@ -110,8 +109,8 @@ def _times(path: Path, number: NDArray[np.int64]) -> NDArray[np.float64] | None:
 
 
 def relation_of_poses(T_wc: NDArray[np.float64], near: float = 5.0) -> NDArray[np.int8]:
-    """Determine which images show the same place from their ``(N, 4, 4)`` poses. Returns the
-    ``(N, N)`` int8 relation (see ``ImageSource``).
+    """Determine from ``(N, 4, 4)`` poses which images show the same place. Returns the ``(N, N)``
+    int8 relation (see ``ImageSource``).
 
     Two images show the same place if they are less than ``near`` metres apart and their viewing
     directions differ by less than 30 degrees. Two images show different places if they are more

@@ -26,16 +26,14 @@ _CACHED = 4  # number of descriptor maps in the least-recently-used cache
 
 
 class LocalDescriptors:
-    """Computes local descriptors of images using a network. The network is loaded when the first
-    image arrives."""
+    """Computes local descriptors of images using a network, which is loaded when the first image
+    arrives."""
 
     def __init__(self, path: Path = SHIPPED_LOCAL) -> None:
-        """
+        """Check that the file of the network exists.
+
         Args:
             path: ONNX file of a network that maps an image to coarse and fine descriptors.
-
-        Raises:
-            InputError: there is no such file.
         """
         if not path.exists():
             fix = "install vslam again" if path == SHIPPED_LOCAL else "name another file"
@@ -57,8 +55,8 @@ class LocalDescriptors:
         """Resize an ``(H, W)`` uint8 image to ``width`` pixels and compute its local descriptors.
 
         Raises:
-            InputError: the file is damaged, or it is not a network that computes local descriptors,
-                or ONNX Runtime is not installed.
+            InputError: the file is damaged or not a network that computes local descriptors, or
+                ONNX Runtime is not installed.
         """
         scale = width / image.shape[1]
         coarse, fine = self._session.run(None, {"image": resized(image, width)})
@@ -79,8 +77,8 @@ def resized(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
 class KeyframeImages:
     """Stores the images of keyframes as JPEG files in memory. An image takes about 40 kB.
 
-    The local descriptors of an image would take thirty times as much memory. They are computed on
-    demand, because most of them are never needed.
+    The local descriptors of an image would take thirty times as much memory, so they are computed
+    on demand.
     """
 
     def __init__(self, network: LocalDescriptors) -> None:
@@ -103,8 +101,7 @@ class KeyframeImages:
         return PerKeyframe(first, np.frombuffer(b"".join(files), np.uint8))
 
     def restore(self, files: PerKeyframe, width: int) -> None:
-        """Store the JPEG files of a map that was loaded from a file. ``files`` is the result of the
-        method ``files``.
+        """Store the JPEG files that the method ``files`` returned.
 
         Args:
             width: width of the camera images, pixels.
@@ -123,8 +120,7 @@ class KeyframeImages:
         """Remove the images of keyframes that were culled from the map.
 
         Args:
-            alive: ``(K,)`` bool with an element for each keyframe up to the last one that was
-                added; False for culled keyframes.
+            alive: ``(K,)`` bool, False for culled keyframes.
         """
         for keyframe in [one for one in self._files if not alive[one]]:
             for kept in (self._files, self._maps, self._glances):
@@ -153,8 +149,8 @@ class KeyframeImages:
         return self._glances[keyframe]
 
     def glance_at(self, image: NDArray[np.uint8]) -> DescriptorMaps:
-        """Resize an image that is not stored to the width that ``glance`` uses, and compute its
-        local descriptors."""
+        """Compute the local descriptors of an image that is not stored, at the width that
+        ``glance`` uses."""
         return self.network.describe(image, GLANCE_WIDTH)
 
     def image(self, keyframe: int) -> NDArray[np.uint8]:

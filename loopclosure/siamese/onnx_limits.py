@@ -1,8 +1,8 @@
 """Checks that an ONNX file from an untrusted source needs only limited time and memory.
 
 A graph of a few hundred bytes can loop forever or create tensors of any size, and ONNX Runtime sets
-no limits. The graphs of vslam use only a few dozen operators. In these graphs, the sizes of all
-tensors follow from the sizes of the inputs. Any other graph is refused before it is run.
+no limits. The graphs of vslam use only a few dozen operators, and the sizes of all tensors follow
+from the sizes of the inputs. Any other graph is refused before it is run.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MOST_NUMBERS = 2**27
 MOST_PRODUCTS = 2**38
 """Maximum total number of multiplications in all convolutions and matrix products of a graph."""
 _MOST_NODES = 10_000
-_SMALL = 64  # tensors with more numbers cannot be shapes
+_SMALL = 64  # tensors with more elements cannot be shapes
 _SIDE = 512  # assumed size of each input dimension that the graph leaves open
 
 # The operators that the networks of vslam use. None of them contains another graph.
@@ -89,12 +89,7 @@ def _check_nodes(model: ModelProto) -> None:
 
 def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
     """Infer the shapes of all tensors of a graph from the shapes of its inputs. Shapes that the
-    file states for other tensors are ignored.
-
-    Raises:
-        Exception: a shape does not follow from the shapes of the inputs, or a tensor has a type
-            that vslam does not use.
-    """
+    file states for other tensors are ignored."""
     graph = model.graph
     for value in graph.input:
         for length in value.type.tensor_type.shape.dim:
@@ -119,8 +114,8 @@ def _shapes(model: ModelProto) -> dict[str, tuple[int, ...]]:
 
 
 def _compute_shapes(graph: GraphProto) -> None:
-    """Replace the nodes of a graph that compute shapes with their results. This is needed because
-    the shape inference of onnx does not evaluate divisions."""
+    """Replace the nodes that compute shapes with their results, because the shape inference of onnx
+    does not evaluate divisions."""
     known = {
         tensor.name: numpy_helper.to_array(tensor)
         for tensor in graph.initializer
@@ -145,11 +140,8 @@ def _compute_shapes(graph: GraphProto) -> None:
 
 
 def _products(node: NodeProto, shapes: dict[str, Any]) -> int:
-    """Count the multiplications of a convolution or a matrix product.
-
-    For other nodes, the result is 0, because they need only a few operations for each element of
-    their output.
-    """
+    """Count the multiplications of a convolution or a matrix product. The result is 0 for other
+    nodes, because they need only a few operations for each element of their output."""
     if node.op_type == "Conv":
         return math.prod(shapes[node.output[0]]) * math.prod(shapes[node.input[1]][1:])
     if node.op_type == "MatMul":

@@ -1,5 +1,6 @@
-"""Writes image sources to one small file, and reads such a file. Such a file is useful on machines
-that have too little space for the original images.
+"""Writes image sources to one small file, and reads such a file.
+
+The file is useful on machines that have too little space for the original images.
 """
 
 from __future__ import annotations
@@ -17,15 +18,8 @@ from vslam.untrusted import read_npz
 
 
 def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> None:
-    """Write image sources as one npz file (docs/howto/training.md).
-
-    The file contains the images of the sources and the relations between the images. The images are
-    stored as JPEG files at the input size of a network.
-
-    Raises:
-        UnreadableImageError: an image is missing or damaged.
-        ResultsError: the file cannot be written.
-    """
+    """Write the images and relations of image sources as one npz file (docs/howto/training.md). The
+    images are stored as JPEG files at the input size of a network."""
     import cv2
 
     arrays: dict[str, NDArray] = {"count": np.array(len(sources))}

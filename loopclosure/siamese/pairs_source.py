@@ -23,10 +23,10 @@ _CELL = 80.0
 def read_pairs(folder: Path) -> list[ImageSource]:
     """Read rendered pairs of images from a folder that contains a file ``pairs.csv``.
 
-    The file must have the columns a and b (image files) and same (1 or 0). It may have further
-    columns. If it has the columns x_a, z_a, yaw_a, x_b, z_b, yaw_b (metres, degrees),
+    The file must have the columns a and b (image files) and same (1 or 0). It may also have the
+    columns x_a, z_a, yaw_a, x_b, z_b, yaw_b (metres, degrees). From these columns,
     ``relation_of_views`` determines whether images of different pairs show the same place. Without
-    these columns, it is unknown whether images of different pairs show the same place.
+    these columns, the relation of such images is unknown.
 
     Raises:
         InputError: the file is missing, malformed or empty.
@@ -73,8 +73,8 @@ def read_pairs(folder: Path) -> list[ImageSource]:
 
 
 def relation_of_views(views: NDArray[np.float64]) -> NDArray[np.int8]:
-    """Determine which images show the same place from their camera poses. Returns the ``(N, N)``
-    int8 relation (see ``ImageSource``).
+    """Determine from camera poses which images show the same place. Returns the ``(N, N)`` int8
+    relation (see ``ImageSource``).
 
     Two images show the same place if they are less than 5 m apart and their viewing directions
     differ by less than 35 degrees. Two images show different places if they are more than 40 m

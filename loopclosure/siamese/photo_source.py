@@ -26,8 +26,7 @@ _UNLIMITED = 1_000_000
 
 @dataclass(frozen=True)
 class _SpecialSet:
-    """Properties of a set of photographs that do not follow from the kind of the set. The
-    properties were copied from the notes of the set.
+    """Properties of a set of photographs, copied from the notes of the set.
 
     Attributes:
         reach: photographs of a folder show the same place if their positions in the sorted folder
@@ -76,8 +75,7 @@ def read_photos(folder: Path) -> list[ImageSource]:
 
     The first line of the notes states the kind of the set. In a set of kind (a), each subfolder
     shows one place. In a set of kind (b), each subfolder is a video whose consecutive frames
-    overlap. In a set of kind (c), the photographs are unrelated. ``_SPECIAL_SETS`` has further
-    properties of some sets.
+    overlap. In a set of kind (c), the photographs are unrelated.
 
     Raises:
         InputError: there is no set of photographs, or the notes do not state the kind.

@@ -54,8 +54,8 @@ _READERS: dict[str, tuple[Callable[..., list[ImageSource]], tuple[str, ...]]] = 
 
 
 def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
-    """Split the specification of an image source, ``kind:path[key=value,...]``, into kind, path and
-    options. The path is empty if the text does not have this form."""
+    """Split ``kind:path[key=value,...]`` into kind, path and options. The path is empty if the text
+    does not have this form."""
     kind, _, rest = spec.partition(":")
     found = re.fullmatch(r"(.+?)(?:\[(.*)\])?", rest)
     if found is None:

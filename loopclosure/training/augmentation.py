@@ -52,8 +52,8 @@ class Augmentation(BaseModel):
     mirror: bool = Field(True, description="Mirror both images of every second pair.")
 
 
-# Only changes in lighting and occlusion are stronger. Rendered pairs already differ in viewpoint.
-# The noise and blur of a camera average out at the resolution of the network.
+# Only changes in lighting and occlusion are stronger than by default. Rendered pairs already differ
+# in viewpoint. The noise and blur of a camera average out at the resolution of the network.
 STRONG = Augmentation(
     homography=0.08, shift=0.12, log_gain=0.5, bias=30.0, log_gamma=0.5, masks=3, mask_area=0.15,
 )  # fmt: skip
@@ -62,11 +62,8 @@ STRONG = Augmentation(
 def augment(
     image: NDArray[np.uint8], strength: Augmentation, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Apply random changes to an ``(H, W)`` uint8 image.
-
-    The changes are applied in the order in which an image is formed: viewpoint, occlusion,
-    lighting, lens, sensor, quantisation to 8 bits.
-    """
+    """Apply random changes to an ``(H, W)`` uint8 image, in the order in which an image is formed:
+    viewpoint, occlusion, lighting, lens, sensor, quantisation to 8 bits."""
     import cv2
 
     height, width = image.shape

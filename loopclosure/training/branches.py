@@ -37,10 +37,12 @@ _LEAST_SHARE = 0.02  # least weight of a view, so that an image without texture 
 class Layout(NamedTuple):
     """The size of a network's input image, and how the image is divided into views.
 
+    A view is a part of the image that has its own descriptor. Views are evenly spaced from left to
+    right.
+
     Attributes:
         size: height and width of the input image.
-        views: number of views. A view is a part of the image that has its own descriptor. Views are
-            evenly spaced from left to right.
+        views: number of views.
         view_width: number of columns of a view. None if the whole image is the only view.
         half_angle, middle: see :class:`preprocessing.Unrolling`. If ``half_angle`` is 0, the image
             is not projected onto a cylinder.
@@ -119,12 +121,11 @@ class CapsuleShape(BaseModel):
 
     @property
     def layout(self) -> Layout:
-        """The size of the input image, and how it is divided into views."""
         return Layout(self.input, self.views, self.view_width, self.half_angle, self.middle)
 
     @property
     def view(self) -> Size:
-        """Height and width of a view. A view is a part of the image with its own descriptor."""
+        """Height and width of a view, which is a part of the image with its own descriptor."""
         return self.pixels, self.view_width or self.input[1]
 
     @property
@@ -145,12 +146,8 @@ class CapsuleShape(BaseModel):
         return [slice(k * step, k * step + columns) for k in range(self.views)]
 
     def for_images_of(self, size: Size) -> CapsuleShape:
-        """Adapt the shape to images with a different height and width. Each view still covers
-        approximately the same fraction of the width.
-
-        Raises:
-            InputError: the views become too narrow.
-        """
+        """Adapt the shape to images of a different size. Each view still covers approximately the
+        same fraction of the width."""
         view = None
         if self.view_width is not None:
             unit, width = self.cut_stride * (self.views - 1), size[1]
@@ -160,8 +157,7 @@ class CapsuleShape(BaseModel):
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Number of rows and number of columns of the feature grid of a view. A cell of the grid is
-        called a place."""
+        """Number of rows and number of columns of the feature grid of a view."""
         height, width = self.view
         if self.extractor == "lite0":
             return lite_grid_side(height), lite_grid_side(width)
@@ -200,12 +196,12 @@ class CapsuleBranch(nn.Module):
 
     The descriptor consists of the flattened output capsules. With several views, it is the
     concatenation of the descriptors of the views, from left to right. The descriptor of each view
-    is multiplied by the fraction of the view that shows texture, because areas without texture do
-    not distinguish places. Such areas are, for example, fog or a covered part of the lens.
+    is multiplied by the fraction of the view that shows texture, because areas without texture,
+    such as fog, do not distinguish places.
 
-    With the extractor lite0, the views are cut from the early features of the whole image. These
-    features are computed only once. Therefore, the features at the border of a view depend on the
-    image next to the view. They do not depend on padding.
+    With the extractor lite0, the views are cut from the early features of the whole image.
+    Therefore, the features at the border of a view depend on the image next to the view, not on
+    padding.
     """
 
     def __init__(self, shape: CapsuleShape) -> None:
@@ -248,8 +244,8 @@ class CapsuleBranch(nn.Module):
         return grey
 
     def _primary_capsules(self, grey: Tensor, texture: Tensor) -> Tensor:
-        """Compute the primary capsules, ``(V N, T, P, A)``, of ``(N, 1, H, W)`` images. ``texture``
-        contains the texture masks of the images from :func:`textured`."""
+        """Compute the primary capsules, ``(V N, T, P, A)``, of ``(N, 1, H, W)`` images and their
+        texture masks."""
         if isinstance(self.extractor, LiteExtractor):
             x = standardised(grey, texture).contiguous(memory_format=torch.channels_last)
             x = self.extractor.late(self._views(self.extractor.early(x)))
@@ -274,6 +270,5 @@ class CapsuleBranch(nn.Module):
 
 
 def _first_fault(error: ValidationError) -> str:
-    """Describe the first error of a validation in a clause."""
     first = error.errors()[0]
     return ": ".join([*map(str, first["loc"]), plain_reason(first["msg"])])

@@ -43,25 +43,23 @@ def route(
     the last iteration.
 
     The sums are rearranged as ``s_j = Σ_t W_tj (Σ_p c_tpj u_tp)`` and the scalar products as
-    ``û_j|i·v_j = u_tp·(W_tjᵀ v_j)``. In this form, sums over the places replace the prediction
-    vectors. The sums over the places are vectors of size A. The prediction vectors have ``I J D``
-    elements, which would have to be written once and read five times.
+    ``û_j|i·v_j = u_tp·(W_tjᵀ v_j)``. In this form, the ``I J D`` elements of the prediction vectors
+    need not be computed.
 
     Args:
         u: ``(N, T, P, A)`` primary capsules.
         W: ``(J, T, A, D)`` matrices, shared by the places of a type.
         iterations: number of iterations, at least 1.
         over: axis of the softmax. With ``primary``, the coupling coefficients sum to 1 over i, as
-            in Zhou and Sun. With ``output``, the coefficients sum to 1 over j, as in Sabour et al.
+            in Zhou and Sun. With ``output``, they sum to 1 over j, as in Sabour et al.
         alive: ``(I,)`` bool, False for primary capsules that are ignored, as if they did not exist.
-            If it is None, all capsules are used.
+            None uses all capsules.
 
     Returns:
-        Three arrays: the output capsules ``v``, ``(N, J, D)``; the numerators of the coupling
-        coefficients ``e``, ``(N, T, J, P)``; the denominators of the coupling coefficients
-        ``total``, ``(N, 1, J, 1)`` or ``(1,)``. :func:`couplings` divides the numerators by the
-        denominators. The coefficients are not divided here, because ``route`` divides only the sums
-        over P. In this way, it needs only a sixth of the divisions.
+        The output capsules ``v``, ``(N, J, D)``, and two arrays from which :func:`couplings`
+        computes the coupling coefficients: the numerators ``e``, ``(N, T, J, P)``, and the
+        denominators ``total``, ``(N, 1, J, 1)`` or ``(1,)``. The coefficients are not computed
+        here, because dividing only the sums over P needs a sixth of the divisions.
     """
     n, types, places, size = u.shape
     outputs, _, _, depth = W.shape
@@ -77,23 +75,22 @@ def route(
         return torch.bmm(pooled, W_j).transpose(0, 1)
 
     def agreements(v: Tensor) -> Tensor:
-        """Compute the ``(N, T, J, P)`` agreements of the prediction vectors with the output
-        capsules ``(N, J, D)``."""
+        """Compute the ``(N, T, J, P)`` agreements of the prediction vectors with output
+        capsules."""
         back = torch.bmm(v.transpose(0, 1), W_j.transpose(1, 2)).view(outputs, n, types, size)
         back = back.permute(1, 2, 0, 3).reshape(n * types, outputs, size)
         return torch.bmm(back, rows.transpose(1, 2)).view(n, types, outputs, places)
 
     def softmax_parts(b: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the numerators and the denominator of the softmax (equation 6 of Zhou and Sun) of
-        ``(N, T, J, P)`` logits. The logits are overwritten."""
+        """Compute the numerators and the denominator of the softmax of ``(N, T, J, P)`` logits
+        (equation 6 of Zhou and Sun). The logits are overwritten."""
         if over == "output":
             c = torch.softmax(b, dim=2)
             return c if present is None else c * present, b.new_ones(1)
         if present is not None:
             b.masked_fill_(~present, -torch.inf)
-        # Subtracting the maximum avoids overflow and does not change a softmax. Two reductions of
-        # one axis each are several times faster than one reduction of two axes that are not
-        # adjacent.
+        # Subtracting the maximum avoids overflow and does not change a softmax. Reducing one axis
+        # after the other is several times faster than reducing both axes at once.
         b -= b.amax(3, keepdim=True).amax(1, keepdim=True)
         e = torch.exp(b)
         return e, e.sum(3, keepdim=True).sum(1, keepdim=True)
@@ -127,14 +124,12 @@ def couplings(e: Tensor, total: Tensor) -> Tensor:
 class CapsuleLayer(nn.Module):
     """The layer that computes output capsules from primary capsules.
 
-    Each primary capsule i has a type t(i), and is located at a place, which is a cell of the
-    feature grid. Its transform to output capsule j is ``W_ij = W_t(i)j diag(g_i)``. There is a
-    matrix for each pair of type and output capsule, and a gain vector of size A for each primary
-    capsule. Therefore, capsules of the same type at different places have different transforms. A
-    separate matrix for each i and j would need tens of millions of parameters.
+    Each primary capsule i has a type t(i) and a place, which is a cell of the feature grid. Its
+    transform to output capsule j is ``W_ij = W_t(i)j diag(g_i)``: a matrix for each pair of type
+    and output capsule, and a gain vector of size A for each primary capsule. A separate matrix for
+    each i and j would need tens of millions of parameters.
 
-    A pruned capsule has no entry in ``gains`` and ``place``, and takes no part in any product or
-    softmax.
+    Pruned capsules have no entry in ``gains`` and ``place``, and are not computed.
 
     Attributes:
         W: ``(J, T, A, D)`` matrices.
@@ -162,8 +157,8 @@ class CapsuleLayer(nn.Module):
         super().__init__()
         kept = places if kept is None else kept
         self.iterations, self.over, self.places = iterations, over, places
-        # A mean over thousands of capsules is a short vector, and short outputs give no agreement.
-        # With half of this deviation, the couplings stay equal. With twice this deviation, a few
+        # A mean over thousands of capsules is a short vector. The deviation makes up for this. With
+        # half of this deviation, the couplings stay equal. With twice this deviation, a few
         # capsules get nearly all of the coupling.
         deviation = _DEVIATION * (types * places / size) ** 0.5 if over == "primary" else 1.0
         self.W = nn.Parameter(torch.randn(outputs, types, size, depth) * deviation)
@@ -177,8 +172,8 @@ class CapsuleLayer(nn.Module):
         return self._route(u)[0]
 
     def routed(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the output capsules, and the ``(N, J, T K)`` coupling coefficients that led to
-        them."""
+        """Compute the ``(N, J, D)`` output capsules and the ``(N, J, T K)`` coupling
+        coefficients."""
         v, e, total = self._route(u)
         return v, couplings(e, total)
 

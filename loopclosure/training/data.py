@@ -89,12 +89,7 @@ def refuse_test_data(sources: list[ImageSource]) -> None:
 
 
 def load(sources: list[ImageSource], size: Size, fit: Fit, threads: int = 2) -> Collection:
-    """Decode all images of all sources into memory. An image of 227x227 pixels takes 51 kB.
-
-    Raises:
-        InputError: there are no sources, or two sources have the same name.
-        UnreadableImageError: an image is missing or damaged.
-    """
+    """Decode all images of all sources into memory. An image of 227x227 pixels takes 51 kB."""
     names = [source.name for source in sources]
     if not sources:
         raise InputError("--data: name at least one source of images.")
@@ -128,11 +123,8 @@ def divide(
     """Split the images into training and validation images. Images of the same unit, for example of
     the same stretch of road, are not split.
 
-    An image of a different unit may show the same place as a validation image, for example at the
-    end of a stretch of road. Such an image is used neither for training nor for validation.
-
-    Raises:
-        InputError: there are too few images.
+    An image of a training unit may show the same place as a validation image, for example at the
+    end of a stretch of road. Such an image is left out.
     """
     rng = np.random.default_rng([seed, 1])
     units = np.unique(collection.unit)
@@ -148,9 +140,8 @@ def divide(
 
 
 def validation_images(validation: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
-    """Choose at most ``most`` of the ``(M,)`` validation images at random. If two training runs
-    have the same seed, they use the same images.
-    """
+    """Choose at most ``most`` of the ``(M,)`` validation images at random. The same seed gives the
+    same images."""
     if len(validation) <= most:
         return validation
     picked = np.random.default_rng([seed, 2]).choice(len(validation), most, replace=False)
@@ -246,12 +237,8 @@ def mine(
 
 
 def write_pairs(path: Path, collection: Collection, pairs: Pairs, seed: int) -> None:
-    """Write a list of image pairs as a CSV file with the columns a, b, same. The first line states
-    the seed.
-
-    Raises:
-        ResultsError: the file cannot be written.
-    """
+    """Write image pairs as a CSV file with the columns a, b, same. The first line states the
+    seed."""
     table = io.StringIO()
     table.write(f"# seed {seed}\n")
     rows = csv.writer(table, lineterminator="\n")

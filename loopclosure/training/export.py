@@ -29,7 +29,7 @@ from vslam.loopclosure.training.siamese import SiameseNetwork, for_inference
 
 TOLERANCE = 1e-4  # largest accepted difference from torch in a descriptor of norm 1
 SIMILARITY_TOLERANCE = 0.02  # large: the square root magnifies rounding at distance 0
-_SMALL = 64  # half precision saves nothing for tensors with fewer numbers
+_SMALL = 64  # half precision saves nothing for tensors with fewer elements
 
 
 class _Embedding(nn.Module):
@@ -48,7 +48,7 @@ class _Comparison(nn.Module):
     """A module that computes the ``(N,)`` similarities of a query image to N gallery images.
 
     The inputs are the ``(V, d)`` descriptors of the V views of the query image, the ``(N, V, d)``
-    descriptors of the views of the gallery images, and the ``(N, V)`` lengths of these gallery
+    descriptors of the views of the gallery images, and the ``(N, V)`` lengths of the gallery
     descriptors.
     """
 
@@ -121,8 +121,7 @@ def to_onnx(
     dynamic_shapes: Any = None,
 ) -> onnx.ModelProto:  # fmt: skip
     """Convert a torch module to an ONNX graph. A tensor is stored in half precision if no precision
-    is lost.
-    """
+    is lost."""
     log = logging.getLogger("torch.onnx")
     level = log.level
     log.setLevel(logging.ERROR)  # hides warnings about missing torchvision and renamed inputs
@@ -145,19 +144,13 @@ def to_onnx(
 
 
 def write_onnx(model: onnx.ModelProto, path: Path, metadata: dict[str, str]) -> None:
-    """Write an ONNX graph with its metadata.
-
-    Raises:
-        ResultsError: the file cannot be written.
-    """
     helper.set_model_props(model, metadata)
     write_file(path, model.SerializeToString())
 
 
 def _halve(graph: onnx.GraphProto) -> None:
-    """Store the tensors of a graph in half precision if no precision is lost. Additional nodes of
-    the graph convert these tensors back to single precision.
-    """
+    """Store the tensors of a graph in half precision if no precision is lost. Nodes that convert
+    these tensors back to single precision are added to the graph."""
     casts = []
     for tensor in graph.initializer:
         if tensor.data_type != TensorProto.FLOAT:

@@ -61,8 +61,7 @@ class Separable(nn.Module):
 
 class Stem(nn.Module):
     """The first layer of the extractor, an ordinary 7x7 convolution. A separable convolution would
-    not be faster, because the image has only one grey channel.
-    """
+    not be faster, because the image has only one grey channel."""
 
     def __init__(self, outputs: int, stride: int) -> None:
         super().__init__()
@@ -114,8 +113,7 @@ class LightExtractor(nn.Sequential):
 
 
 def grid_side(pixels: int, blocks: Collection[Block] = LIGHT_BLOCKS) -> int:
-    """Compute the number of cells along one side of the feature grid, for an image with a side of
-    ``pixels``."""
+    """Compute the number of cells of the feature grid along a side of ``pixels``."""
     for _, stride, _ in blocks:
         pixels = (pixels - 1) // stride + 1
     return pixels

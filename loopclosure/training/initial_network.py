@@ -97,11 +97,10 @@ def starting_network(
 
 
 def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
-    """Adapt a network to a different layout, for further training. The layout consists of the image
-    size, the views, and the cylindrical projection.
+    """Adapt a network to a different layout of the input image, for further training.
 
-    Convolutions and transforms stay the same. The gains of the places (cells of the feature grid)
-    are interpolated over the new grid.
+    The gains of the places (cells of the feature grid) are interpolated over the new grid. All
+    other weights stay the same.
 
     With this function, most of the training can use small images, and the training takes a third of
     the time. The method is called progressive resizing (Howard, DAWNBench entry of fast.ai, 2018).
@@ -128,8 +127,6 @@ def resized(network: SiameseNetwork, layout: Layout) -> SiameseNetwork:
 
 
 def _fitted(network: SiameseNetwork, settings: TrainSettings) -> SiameseNetwork:
-    """Return the network itself if it already has the layout of the settings, or else a resized
-    copy."""
     layout = settings.shape.layout
     return network if network.branch.layout == layout else resized(network, layout)
 
@@ -171,8 +168,8 @@ def milliseconds_per_image(*networks: SiameseNetwork, repeats: int = 50) -> list
     """Measure the time that each network takes to embed one image on one core, in milliseconds.
 
     The networks are measured in turn, so that other processes on the machine affect all networks
-    equally. Each measurement is repeated, and the shortest time is returned. The reason is that
-    other processes can only make a measurement longer.
+    equally. The shortest of ``repeats`` measurements is returned, because other processes can only
+    make a measurement longer.
     """
     best = [float("inf")] * len(networks)
     threads = torch.get_num_threads()

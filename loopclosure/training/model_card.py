@@ -29,8 +29,7 @@ def describe(
     data: list[str],
     device: str,
 ) -> dict[str, Any]:
-    """Collect the contents of the model card: the information that is needed to judge or reproduce
-    the weights of a network."""
+    """Collect the information that is needed to judge or reproduce the weights of a network."""
     return {
         "network": network.name,
         "parameters": network.n_parameters(),
@@ -63,11 +62,7 @@ def describe(
 
 def write_card(card: dict[str, Any], weights: Path) -> tuple[Path, Path]:
     """Write a model card as ``NAME.json`` and ``NAME.md`` next to the weights. Returns the paths of
-    both files.
-
-    Raises:
-        ResultsError: a file cannot be written.
-    """
+    both files."""
     figures = "".join(f"| {k} | {v:.4g} |\n" for k, v in card["validation"].items())
     sources = "".join(f"| {k} | {v} |\n" for k, v in card["sources"].items())
     text = (

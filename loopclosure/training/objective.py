@@ -20,17 +20,17 @@ _MOST_SAME = 5  # a validation query is compared with at most this many images o
 
 
 def cross_entropy(logits: Tensor, same: Tensor) -> Tensor:
-    """Compute the binary cross-entropy from the logits of p (equation 3 of Zhou and Sun, 2025). It
-    is the mean over all pairs of ``-(y log p + (1 - y) log(1 - p))``."""
+    """Compute the binary cross-entropy from the logits of p (equation 3 of Zhou and Sun, 2025): the
+    mean over all pairs of ``-(y log p + (1 - y) log(1 - p))``."""
     return functional.binary_cross_entropy_with_logits(logits, same.to(logits.dtype))
 
 
 def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) -> Tensor:
-    """Compute the InfoNCE loss. For each pair of images of the same place, this loss compares their
-    similarity with the similarities to all images of other places in the batch.
+    """Compute the InfoNCE loss (van den Oord et al., 2018) in the symmetric form of CLIP. For each
+    pair of images of the same place, this loss compares their similarity with the similarities to
+    all images of other places in the batch.
 
-    The loss is that of van den Oord et al. (2018), in the symmetric form of CLIP. Zhou and Sun
-    (2025) do not use this loss.
+    Zhou and Sun (2025) do not use this loss.
 
     Args:
         alike: ``(2 N, 2 N)`` cosine similarities of the images of N pairs. The first images of all
@@ -54,7 +54,7 @@ def contrast(alike: Tensor, same: Tensor, relation: Tensor, temperature: float) 
 def embed_all(
     network: SiameseNetwork, images: NDArray[np.uint8], device: torch.device, batch: int = 64
 ) -> NDArray[np.float32]:
-    """Compute the ``(N, D)`` descriptors of ``(N, H, W)`` images. The network is set to eval
+    """Compute the ``(N, D)`` descriptors of ``(N, H, W)`` uint8 images. The network is set to eval
     mode."""
     network.eval()
     parts = [
@@ -86,17 +86,16 @@ def validate(
     strength: Augmentation,
     device: torch.device,
 ) -> tuple[dict[str, float], NDArray[np.float32], NDArray[np.bool_]]:
-    """Measure how well a network retrieves images of the same place among the validation images.
-    The queries are augmented copies of these images.
+    """Measure how well a network recognises augmented copies of the validation images.
 
-    Only pairs of images are used for which it is known whether both images show the same place.
-    Each query is paired with at most five images of its place, and with all images that are known
-    to show different places. Therefore, most pairs show different places, as in a SLAM run. Every
-    call uses the same augmentations and pairs.
+    Only pairs of images with a known relation are used. Each augmented copy is paired with at most
+    five images of its place, and with all images that are known to show different places.
+    Therefore, most pairs show different places, as in a SLAM run. Every call uses the same
+    augmentations and pairs.
 
     Returns:
         The measures of :func:`vslam.loopclosure.precision_recall.summary`, and the scores and
-        labels of the pairs from which these measures are computed.
+        labels of the pairs.
     """
     images = collection.images[chosen]
     augmented = np.stack(
@@ -124,8 +123,8 @@ def blend(network: SiameseNetwork, before: dict[str, Tensor], share: float) -> N
     """Interpolate the weights of a network in place. If ``share`` is 0, the result has the weights
     ``before``. If it is 1, the current weights do not change.
 
-    Interpolated weights keep most of what fine-tuning has learned. Interpolated weights also keep
-    more of what the original network had learned (WiSE-FT, Wortsman et al., CVPR 2022).
+    Interpolated weights keep most of what fine-tuning has learned, and more of what the original
+    network had learned (WiSE-FT, Wortsman et al., CVPR 2022).
     """
     after = network.state_dict()
     mixed = {
@@ -141,8 +140,7 @@ def calibrate(network: SiameseNetwork, score: NDArray, same: NDArray) -> None:
     p is a calibrated probability.
 
     In the fit, the pairs of the same place have the same total weight as the pairs of different
-    places. The fit does not change the order of the scores. Therefore, it does not change the
-    average precision.
+    places. The order of the scores and the average precision do not change.
     """
     head = network.head
     a, b = head.log_a.exp().item(), head.log_b.exp().item()

@@ -23,13 +23,10 @@ def to_tensor(images: NDArray[np.uint8]) -> Tensor:
 
 
 class Unrolling(nn.Module):
-    """Projects images onto a cylinder. In a projected image, a rotation of the camera appears as a
-    horizontal shift.
+    """Projects images onto a cylinder (Szeliski, Image Alignment and Stitching: A Tutorial, 2006,
+    section 2.3). In a projected image, a rotation of the camera appears as a horizontal shift.
 
-    The method is that of Szeliski, Image Alignment and Stitching: A Tutorial, 2006, section 2.3. In
-    a flat image, objects become wider and taller towards the sides. Therefore, a rotation of the
-    camera by 30 degrees does not merely shift the image, and no single shift aligns the whole
-    image. Zhou and Sun (2025) do not use this projection.
+    Zhou and Sun (2025) do not use this projection.
 
     Column ``x`` of the projected image, in [-1, 1], shows the direction ``x half_angle``. In this
     column, row ``y`` shows the row ``middle y / cos(x half_angle)`` of the flat image. The sides of
@@ -39,8 +36,8 @@ class Unrolling(nn.Module):
         size: height and width of the images.
         half_angle: angle from the middle of the image to either side, in degrees. If it is 0,
             images are not projected. The same value is used for all cameras, because some cameras
-            are not calibrated. If the value is the half angle of the camera itself, a rotation
-            becomes exactly a shift. Otherwise, it becomes approximately a shift.
+            are not calibrated. If the field of view of a camera differs, a rotation is only
+            approximately a shift.
         middle: fraction of the image height that the middle column of the projected image shows. If
             it is the cosine of ``half_angle``, the outermost columns show the whole height, and no
             pixel is black. If it is 1, the middle column shows the whole height.

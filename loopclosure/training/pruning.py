@@ -1,8 +1,8 @@
 """Prunes a network: removes the primary capsules with the lowest coupling coefficients.
 
-Zhou and Sun (Sci Rep 15, 7644, 2025) rank primary capsules by their coupling coefficients. The
-authors set the matrices W_ij of the 20 % with the lowest coefficients to 0. Zeros do not make the
-network faster. Therefore, this module removes the capsules from the network.
+Zhou and Sun (Sci Rep 15, 7644, 2025) set the matrices of the 20 % of the primary capsules with the
+lowest coupling coefficients to 0. Zeros do not make the network faster. Therefore, this module
+removes the capsules from the network.
 """
 
 from __future__ import annotations
@@ -20,15 +20,12 @@ from vslam.loopclosure.training.siamese import SiameseNetwork
 
 @torch.no_grad()
 def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor:
-    """Compute the ``(T, K)`` activity of each primary capsule i. It is the mean of the coupling
-    coefficients c_ij over all images and all output capsules j.
+    """Compute the ``(T, K)`` activity of the primary capsules: the mean of the coupling
+    coefficients c_ij of capsule i over all images and all output capsules j.
 
     Args:
         network: the network, which must be in eval mode.
         batches: batches of training images, ``(N, 3, H, W)`` each.
-
-    Raises:
-        InputError: there are no images.
     """
     branch = network.branch
     total, count = None, 0
@@ -49,8 +46,8 @@ def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
     ``(T, K)`` bool mask.
 
     Zhou and Sun (2025) do not say how many capsules they remove from each type. This function
-    selects the same number for all types. In this way, a single dense matrix product can still
-    compute all types together. If capsules have equal activity, the capsule with the lower index is
+    selects the same number for all types, so that a single dense matrix product can still compute
+    all types together. If capsules have equal activity, the capsule with the lower index is
     selected first.
     """
     dropped = round(fraction * activity.shape[1])
@@ -60,8 +57,8 @@ def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
 
 
 def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
-    """Copy a network and mask the primary capsules ``drop`` in the copy. Masked capsules are
-    ignored, but still computed. ``drop`` is ``(T, K)`` bool."""
+    """Copy a network and mask the primary capsules ``drop``, ``(T, K)`` bool, in the copy. Masked
+    capsules are ignored, but still computed."""
     copied = copy.deepcopy(network)
     layer = copied.branch.capsules
     layer.alive.copy_(~drop.flatten())
@@ -70,8 +67,8 @@ def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
 
 
 def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") -> SiameseNetwork:
-    """Copy a network without the primary capsules ``drop``. ``drop`` is ``(T, K)`` bool, with the
-    same number of capsules for each type.
+    """Copy a network without the primary capsules ``drop``, ``(T, K)`` bool. The number of removed
+    capsules must be the same for each type.
 
     Args:
         name: name of the copy, one of ``PRUNED``.

@@ -14,8 +14,7 @@ from vslam.loopclosure.training.branches import CapsuleShape
 
 class TrainSettings(BaseModel):
     """The settings of a training run. They are stored in the file ``settings.json``, and the option
-    ``--settings`` reads such a file.
-    """
+    ``--settings`` reads such a file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -123,9 +122,5 @@ PRESETS = {
 
 def load_settings(path: Path) -> TrainSettings:
     """Read the settings of a training run from a JSON file. Settings that are missing in the file
-    keep their defaults.
-
-    Raises:
-        InputError: the file is missing or not JSON, a key is unknown, or a value is out of range.
-    """
+    keep their defaults."""
     return read_json(TrainSettings, path, "settings")

@@ -26,15 +26,13 @@ def aligned(alike: Tensor, most: Tensor) -> Tensor:
     """Compute the cosine similarity of two images after the best horizontal alignment of their
     views.
 
-    An image is divided into views from left to right, and the descriptor of the image consists of
-    the descriptors of its views. After a rotation of the camera, an object appears in a different
-    view. Therefore, the views of one image are shifted to the left or right, by up to half the
-    number of views. For each shift, a cosine similarity is computed from the views that overlap.
+    An image is divided into views from left to right, and each view has a descriptor. After a
+    rotation of the camera, an object appears in a different view. Therefore, the views of one image
+    are shifted to the left or right, by up to half the number of views. For each shift, a cosine
+    similarity is computed from the views that overlap.
 
-    The result is the soft maximum of these similarities. A soft maximum is used because two shifts
-    may fit about equally well. This happens if the camera has moved forwards. It also happens if
-    the camera has rotated by half the angle between two neighbouring views. The result can slightly
-    exceed 1. Zhou and Sun (2025) compare only whole images.
+    The result is the soft maximum of these similarities, because two shifts may fit about equally
+    well. The result can slightly exceed 1. Zhou and Sun (2025) compare only whole images.
 
     Args:
         alike: ``(..., V, V)`` scalar products of the descriptors of views. Element ``[..., i, j]``
@@ -76,8 +74,7 @@ class DistanceHead(nn.Module):
     """Computes the probability p that two images show the same place from the distance d of their
     descriptors: ``p = sigmoid(a - b d)`` with a, b > 0 (equations 2 and 10 of Zhou and Sun, 2025).
 
-    If the images have several views, d is computed from the cosine similarity after the views are
-    aligned (:func:`aligned`).
+    If the images have several views, the views are first aligned (:func:`aligned`).
     """
 
     def __init__(self, views: int = 1) -> None:
@@ -143,8 +140,7 @@ class SiameseNetwork(nn.Module):
 
     def logits(self, a: Tensor, b: Tensor) -> Tensor:
         """Compute the ``(N,)`` logits of the probabilities that ``similarity`` returns. The
-        training loss is computed from the logits.
-        """
+        training loss is computed from the logits."""
         return self.head(a, b)
 
     def similarity(self, a: Tensor, b: Tensor) -> Tensor:
@@ -155,31 +151,24 @@ class SiameseNetwork(nn.Module):
     def compare(self, query: Tensor, gallery: Tensor) -> Tensor:
         """Compute the ``(M,)`` probabilities that a query image and each of M gallery images show
         the same place. ``query`` is a ``(D,)`` descriptor, and ``gallery`` contains ``(M, D)``
-        descriptors.
-        """
+        descriptors."""
         by_view = _by_view(gallery, self.branch.views)
         query = _by_view(query[None], self.branch.views)[0]
         return torch.sigmoid(self.head.compare(query, by_view, _lengths(by_view)))
 
     def forward(self, images: Tensor) -> Tensor:
-        """Compute the descriptors of images, as :meth:`embed` does."""
         return self.embed(images)
 
     def n_parameters(self) -> int:
-        """Return the number of learned parameters."""
         return sum(p.numel() for p in self.parameters())
 
 
 def build_network(name: str, shape: CapsuleShape | None = None) -> SiameseNetwork:
-    """Create a network with random weights. They are drawn from torch's global random generator.
+    """Create a network with random weights from torch's global random generator.
 
     Args:
         name: one of ``NETWORKS``.
-        shape: structure of the capsule branch. If it is None, the structure of Zhou and Sun (2025)
-            is used.
-
-    Raises:
-        InputError: the name is unknown.
+        shape: structure of the capsule branch. None gives the structure of Zhou and Sun (2025).
     """
     if name not in NETWORKS:
         raise InputError(f"{name}: no such network; choose one of {', '.join(NETWORKS)}.")
@@ -195,9 +184,6 @@ def save_network(
 
     Args:
         half: whether the weights are stored in half precision, as for the weights that vslam ships.
-
-    Raises:
-        ResultsError: the file cannot be written.
     """
     tensors = {
         key: value.detach().half() if half and value.is_floating_point() else value.detach()
@@ -214,8 +200,8 @@ def save_network(
 
 
 def load_network(path: Path) -> tuple[SiameseNetwork, dict[str, Any]]:
-    """Read a network from a file that was written by :func:`save_network`. Returns the network in
-    eval mode, and the argument ``about`` of :func:`save_network`.
+    """Read a network that :func:`save_network` wrote. Returns the network in eval mode, and the
+    argument ``about`` of :func:`save_network`.
 
     Raises:
         InputError: the file is missing, damaged or not from this version of vslam.

@@ -63,7 +63,7 @@ OnStep = Callable[[int, int, int, float], None]
 """Arguments: epoch, step, number of steps in the epoch, loss."""
 
 _CHECKPOINT_EVERY_S = 300.0
-_HEAD_RATE = 30.0  # factor for the scalars log a and log b: Adam's steps are too small for them
+_HEAD_RATE = 30.0  # factor for the learning rate of log a and log b, which need larger steps
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ class TrainingOutcome:
     """The result of a training run.
 
     Attributes:
-        finished: False if the training run was stopped early. In this case, the training run can be
-            continued by calling ``train`` with ``resume=True``.
+        finished: False if the training run was stopped early. It can be continued by calling
+            ``train`` with ``resume=True``.
         figures: validation metrics of the best network after calibration.
         progress: the progress of the training run, with the loss and the validation metrics of
             every epoch.
@@ -104,9 +104,7 @@ def train(
     checkpoints to a folder.
 
     Args:
-        collection: the images and their relations.
-        settings: settings of the training run.
-        folder: output folder. The name of the file of weights is ``settings.network``.
+        folder: output folder. The weights are written to ``<settings.network>.safetensors``.
         device: ``cpu`` or ``cuda``.
         threads: number of threads that augment images.
         resume: whether training continues from the checkpoint in the folder, if there is one.
@@ -195,11 +193,7 @@ def calibrated(
     weights: Path,
     device: torch.device,
 ) -> dict[str, float]:
-    """Calibrate a network and write its weights. Returns the validation metrics of the network.
-
-    Raises:
-        ResultsError: the file cannot be written.
-    """
+    """Calibrate a network and write its weights. Returns the validation metrics of the network."""
     _, score, same = validate(network, collection, validation, settings.augmentation, device)
     calibrate(network, score, same)
     figures = validate(network, collection, validation, settings.augmentation, device)[0]
@@ -209,8 +203,6 @@ def calibrated(
 
 @dataclass(frozen=True)
 class _Training:
-    """A training run in progress: its data, the network, the optimiser and the progress."""
-
     collection: Collection
     settings: TrainSettings
     network: SiameseNetwork
@@ -223,7 +215,6 @@ class _Training:
 
     @property
     def steps(self) -> int:
-        """Number of steps in an epoch."""
         return max(1, self.settings.pairs // self.settings.batch)
 
     def step(self, pairs: Pairs) -> float:
@@ -277,7 +268,6 @@ class _Training:
         return to_tensor(np.stack(list(self.pool.map(augmented, jobs))))
 
     def pairs_of_epoch(self) -> Pairs:
-        """Draw the image pairs of the current epoch."""
         settings, network, images, hard = self.settings, self.network, self.images, None
         rng = np.random.default_rng([settings.seed, 4, self.progress.epoch])
         # There are no hard pairs in the first epoch, because random weights would not find any.
@@ -297,9 +287,7 @@ class _Training:
         )  # fmt: skip
 
     def end_epoch(self, validation: NDArray[np.int64], weights: Path) -> None:
-        """Validate the network after an epoch. If its weights are the best so far, they are written
-        to a file.
-        """
+        """Validate the network, and write its weights to a file if they are the best so far."""
         network, progress = self.network, self.progress
         augmentation = self.settings.augmentation
         figures = validate(network, self.collection, validation, augmentation, self.device)[0]
@@ -321,8 +309,6 @@ class _Training:
 
 
 def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.Optimizer:
-    """Create an Adam optimiser with separate learning rates for the extractor and the head. Frozen
-    blocks are excluded."""
     extractor = network.branch.extractor
     if isinstance(extractor, LiteExtractor):
         extractor.freeze(settings.frozen)
@@ -336,7 +322,6 @@ def _optimiser(network: SiameseNetwork, settings: TrainSettings) -> torch.optim.
 
 
 def set_threads(threads: int) -> None:
-    """Set the number of threads that torch uses."""
     torch.set_num_threads(threads)
 
 
@@ -354,7 +339,6 @@ def open_device(name: str) -> torch.device:
 
 
 def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
-    """Return whether the network computes in bfloat16."""
     supported = device.type == "cpu" or torch.cuda.is_bf16_supported()
     if settings.mixed_precision and not supported:
         raise InputError("mixed_precision: this GPU does not support bfloat16; leave it out.")
@@ -364,11 +348,7 @@ def _mixed_precision(settings: TrainSettings, device: torch.device) -> bool:
 
 
 def write_log(path: Path, history: list[dict[str, float]]) -> None:
-    """Write the loss and the validation metrics of each epoch as a CSV file.
-
-    Raises:
-        ResultsError: the file cannot be written.
-    """
+    """Write the loss and the validation metrics of each epoch as a CSV file."""
     table = io.StringIO()
     rows = csv.DictWriter(table, list(history[0]), lineterminator="\n")
     rows.writeheader()

@@ -145,11 +145,6 @@ def calibrate(
 
 
 def _check_place(out: Path) -> None:
-    """Check that the calibration can be written to a file, before any work begins.
-
-    Raises:
-        InputError: the file cannot be written, is not YAML, or belongs to another program.
-    """
     from vslam.calibration.documents import read_document
     from vslam.maps.new_output import require_place
 
@@ -161,10 +156,9 @@ def _check_place(out: Path) -> None:
 
 
 def _keep_earlier(*files: Path) -> None:
-    """Rename the files of an earlier calibration.
+    """Rename the files of an earlier calibration, for example ``a.yaml`` to ``a-1.yaml``.
 
-    ``a.yaml`` is renamed to ``a-1.yaml``. All files get the same number. It is the smallest number
-    for which none of the new names exists.
+    All files get the same number, the smallest one for which none of the new names exists.
     """
     for n in count(1):
         kept = {path: path.with_stem(f"{path.stem}-{n}") for path in files}
@@ -184,7 +178,6 @@ def _keep_earlier(*files: Path) -> None:
 def _board(
     kind: str, size: str, square: float | None, marker: float | None, tags: str, *, stereo: bool
 ) -> Board:
-    """Create the calibration board that the command-line options describe."""
     from vslam.calibration.boards import Board, Kind, read_board
 
     if kind not in get_args(Kind):
@@ -213,11 +206,9 @@ def _board(
 
 
 def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
-    """Yield the frames of a source, or a sample of them.
+    """Yield the frames of a source, or about ``most`` evenly spread frames if it has more.
 
-    If the source has more than ``most`` frames, about ``most`` frames are yielded, which are spread
-    evenly. If the source ends early because it is damaged, a warning is printed, and the frames
-    that could be read are used.
+    If the source ends early because it is damaged, a warning is printed.
 
     Raises:
         BrokenSourceError: fewer than two frames can be read.
@@ -235,11 +226,7 @@ def _frames(raw: RawSource, most: int) -> Iterator[TimedFrame]:
 
 
 def _search(raw: RawSource, board: Board) -> tuple[list[Frame], list[Image]]:
-    """Search images for the calibration board.
-
-    Returns:
-        The corners of the board that were found in each frame, and some of the left images.
-    """
+    """Return the corners of the board in each frame, and some of the left images."""
     from vslam.calibration.boards import find_corners, same_order
 
     total = min(raw.n_expected or _MOST_SEARCHED, _MOST_SEARCHED)

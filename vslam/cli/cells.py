@@ -56,16 +56,10 @@ def choose_systems(
     python: Path | None,
     vocabulary: Path | None,
 ) -> Systems:
-    """Return the systems that the options select.
-
-    Raises:
-        InputError: no system is selected, a system is unknown, or a file that a system needs is
-            missing.
-    """
     from vslam.loopclosure.registry import parse_weights, require_detector
 
     wanted = names_in(systems)
-    others = _others(wanted, given, python, vocabulary)
+    others = _command_templates(wanted, given, python, vocabulary)
     chosen = names_in(detectors) if "vslam" in wanted else []
     files = parse_weights(weights, chosen)
     for name in chosen or [""] * ("vslam" in wanted):
@@ -79,10 +73,9 @@ def choose_systems(
     return Systems(chosen, files, others)
 
 
-def _others(
+def _command_templates(
     wanted: list[str], given: Collection[str], python: Path | None, vocabulary: Path | None
 ) -> dict[str, str]:
-    """Return the command template of each other system, by name of the system."""
     from vslam.lab.stress import orbslam3
     from vslam.lab.stress.external import check_template
 
@@ -141,9 +134,8 @@ class Cells:
     console: Console
 
     def grid(self, perturbations: Collection[str], seeds: int) -> list[Cell]:
-        """Return the cells of the benchmark's grid (``vslam.lab.bench.grid.make_grid``).
-
-        Each cell is one run of a system on a sequence, with a perturbation and a random seed.
+        """Return the runs of the benchmark. Each run is one system on one sequence, with a
+        perturbation and a random seed.
 
         Args:
             perturbations: the perturbations to apply to the sequences.
@@ -159,13 +151,14 @@ class Cells:
         )  # fmt: skip
 
     def prepare(self) -> None:
-        """Create the folder of the results (``vslam.lab.bench.execute.prepare``)."""
+        """Create the folder of the results."""
         from vslam.lab.bench.execute import prepare
 
         prepare(self.out, _identity(self.kind, self.given))
 
     def run(self, cells: Collection[Cell]) -> Generator[CellOutcome, None, None]:
-        """Perform some of the runs on this machine or on a cluster, and yield their outcomes."""
+        """Perform the given runs, and yield their outcomes. They are performed by Dask workers if
+        the option ``--scheduler`` was given, and otherwise on this machine."""
         if self.scheduler is not None:
             from vslam.lab.bench.cluster import run_on_cluster
 
@@ -174,7 +167,7 @@ class Cells:
         from vslam.machine import available_cores
         from vslam.run.warmup import compile_kernels, is_cold
 
-        if cells and is_cold():  # once, not in each run
+        if cells and is_cold():  # compiled once here, not in each run
             self.console.announce("first run: compiling the kernels, about a minute ...")
             compile_kernels(processes=min(available_cores(), 2))
         return run_here(cells, self.options, self.jobs, self.out)
@@ -197,9 +190,6 @@ def open_cells(
     Args:
         seqs: list of sequences, such as "00-05" or "00,demo". None for data that has only one
             sequence.
-
-    Raises:
-        InputError: data are missing or cannot be used.
     """
     from vslam.lab.bench.execute import RunOptions, scratch_folder
     from vslam.machine import available_cores
@@ -219,7 +209,8 @@ def open_cells(
     program = (sys.executable, "-m", "vslam.cli.child", "foreign")
     options = RunOptions(
         data=Path(given.data) if kind != "synthetic" else None,
-        config=read_thresholds(config).model_dump_json(indent=2) + "\n",  # as a run writes it
+        config=read_thresholds(config).model_dump_json(indent=2)
+        + "\n",  # in the form in which a run writes it
         threads=threads or max(1, min(available_cores() // jobs, 4)),
         scratch=None if scheduler else scratch_folder(out),
         others={name: (*program, name, command) for name, command in systems.others.items()},
@@ -242,10 +233,7 @@ def _absolute(given: SourceOptions) -> SourceOptions:
 
 
 def _words_of(given: SourceOptions) -> list[str]:
-    """Return the options of ``vslam run`` that describe the data.
-
-    Options that differ between the runs of a benchmark are left out.
-    """
+    """Return the options of ``vslam run`` that describe the data and are the same for all runs."""
     words = ["--side-by-side"] if given.side_by_side else []
     values = {
         "--right": given.right,
@@ -271,8 +259,7 @@ def _open_all(
 ) -> dict[str, Source]:
     """Open every sequence, so that missing data are reported before the first run.
 
-    This function renders synthetic sequences, so that parallel runs do not render the same
-    sequence.
+    Synthetic sequences are rendered here, so that parallel runs do not render the same sequence.
     """
     from vslam.datasets.sources import LIVE
     from vslam.lab.bench.grid import parse_sequences

@@ -1,8 +1,7 @@
 """Runs a command of vslam in a child process, which ends when its parent process ends.
 
 The child process is started with ``python -m vslam.cli.child run ...``. Its standard input is a
-pipe from the parent process. When the parent ends, even if it is killed, the pipe closes. The child
-process then ends, too, because nobody would read its results.
+pipe from the parent process, which closes when the parent ends, even if the parent is killed.
 """
 
 from __future__ import annotations

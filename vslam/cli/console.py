@@ -14,14 +14,13 @@ class Console:
     """Draws progress bars and prints messages. If ``shown`` is False, it does nothing.
 
     The package rich is imported only when something is shown, because its import takes as long as
-    tracking forty frames. A progress bar appears when its first step is done.
+    tracking forty frames.
     """
 
     def __init__(self, *, shown: bool) -> None:
         self._shown = shown
 
     def announce(self, message: str) -> None:
-        """Print a message."""
         if self._shown:
             from rich.console import Console as RichConsole
 
@@ -29,9 +28,8 @@ class Console:
 
     @contextmanager
     def progress_bar(self, total: int | None) -> Iterator[Callable[[TrackResult], None]]:
-        """Show a bar with the progress, speed, tracking state and remaining time of a run.
-
-        The method yields a function, which must be called with the result of each frame.
+        """Show a bar with the progress, speed, tracking state and remaining time of a run. Yields a
+        function that must be called with the result of each frame.
 
         Args:
             total: approximate number of frames. None if it is unknown.
@@ -42,21 +40,15 @@ class Console:
 
     @contextmanager
     def render_bar(self) -> Iterator[Callable[[int, int], None]]:
-        """Show a bar for rendering.
-
-        The method yields a function, which must be called with the number of rendered frames and
-        the number of all frames.
-        """
+        """Show a bar for rendering. Yields a function that must be called with the number of
+        rendered frames and the number of all frames."""
         with self._bar("rendering", fps=True) as update:
             yield lambda done, total: update(total=total, completed=done)
 
     @contextmanager
     def training_bar(self) -> Iterator[Callable[[int, int, int, float], None]]:
-        """Show a bar for training.
-
-        The method yields a function, which must be called with the epoch, the step, the steps per
-        epoch and the loss.
-        """
+        """Show a bar for training. Yields a function that must be called with the epoch, the step,
+        the steps per epoch and the loss."""
         with self._bar("epoch {task.fields[epoch]}", ("loss {task.fields[loss]:.3f}",)) as update:
             yield lambda epoch, step, steps, loss: update(
                 anew=step == 1, total=steps, completed=step, epoch=epoch, loss=loss
@@ -64,11 +56,8 @@ class Console:
 
     @contextmanager
     def count_bar(self, what: str, total: int) -> Iterator[Callable[[], None]]:
-        """Show a bar that counts items.
-
-        The method yields a function, which must be called whenever one of the ``total`` items is
-        done.
-        """
+        """Show a bar that counts items. Yields a function that must be called whenever one of the
+        ``total`` items is done."""
         with self._bar(what) as update:
             update(total=total)
             yield lambda: update(advance=1)
@@ -77,11 +66,8 @@ class Console:
     def _bar(
         self, before: str = "", after: tuple[str, ...] = (), *, fps: bool = False
     ) -> Iterator[Callable[..., None]]:
-        """Show a bar, and yield a function that updates it.
-
-        This function has the arguments of rich's ``Progress.update``. Its additional argument
-        ``anew`` restarts the bar.
-        """
+        """Show a bar when its first step is done. Yields a function with the arguments of rich's
+        ``Progress.update``. Its additional argument ``anew`` restarts the bar."""
         if not self._shown:
             yield lambda **changes: None
             return

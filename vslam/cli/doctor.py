@@ -66,7 +66,7 @@ def doctor(
         diagnosis = Diagnosis([Finding("input", "fault", measured or fix, fix if measured else "")])
     for line in lines(diagnosis.findings):
         typer.echo(line)
-    page = out or _free(Path("doctor.html"))
+    page = out or _unused_path(Path("doctor.html"))
     # The findings are printed first, because the disk may be full.
     write_page(diagnosis, f"Doctor: {given.data or given.dataset}", page)
     n = len(diagnosis.faults)
@@ -75,11 +75,6 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _free(path: Path) -> Path:
-    """Return a path at which no file exists.
-
-    This is the given path if it is free. Otherwise, it is the first free path of ``doctor-2.html``,
-    ``doctor-3.html``, ...
-    """
+def _unused_path(path: Path) -> Path:
     numbered = (path.with_stem(f"{path.stem}-{n}") for n in count(2))
     return next(one for one in chain((path,), numbered) if not one.exists())

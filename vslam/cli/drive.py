@@ -27,10 +27,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Output:
-    """Options that determine what a run shows and writes.
-
-    These options may be changed when a run is resumed.
-    """
+    """Options that determine what a run shows and writes. They may be changed when a run is
+    resumed."""
 
     record: bool
     view: Literal["native", "web"] | None
@@ -120,11 +118,6 @@ def drive(
 
 
 def _open(options: RunOptions, console: Console) -> tuple[Source, Perturbation]:
-    """Open the images of a run, and create the perturbation that is applied to them.
-
-    Raises:
-        InputError: the images cannot be read, or data that the perturbation needs is missing.
-    """
     from vslam.datasets.perturbation import parse_perturbation
 
     perturbation = parse_perturbation(options.perturb, options.seed)
@@ -134,10 +127,7 @@ def _open(options: RunOptions, console: Console) -> tuple[Source, Perturbation]:
 
 
 def _fixes(path: Path, antenna: tuple[float, ...] | None, source: Source) -> Fixes:
-    """Read the GPS fixes from the file of ``--gps``.
-
-    The times of the fixes must overlap with the times of the images.
-    """
+    """Read the GPS fixes. Their times must overlap with the times of the images."""
     from vslam.datasets.fixes import read_fixes, require_overlap
 
     fixes = read_fixes(path, antenna)
@@ -146,12 +136,8 @@ def _fixes(path: Path, antenna: tuple[float, ...] | None, source: Source) -> Fix
 
 
 def _georeferenced(outcome: RunOutcome, fixes: Fixes) -> tuple[RunOutcome, str]:
-    """Georeference the trajectory of a finished run.
-
-    Returns:
-        The outcome of the run with the georeferenced trajectory, and an error message. The message
-        is empty on success.
-    """
+    """Return the outcome of a run with the georeferenced trajectory, and an error message, which is
+    empty on success."""
     from vslam.plugins import reason
     from vslam.run.gps import locate
 
@@ -167,7 +153,6 @@ def _georeferenced(outcome: RunOutcome, fixes: Fixes) -> tuple[RunOutcome, str]:
 
 
 def _refuse_live_source(source: Source, resume: Path | None) -> None:
-    """Refuse to resume a run of a live camera, because its images cannot be read again."""
     if source.live and resume is not None:
         raise InputError(
             f"--resume {resume}: a run of a live camera cannot be resumed; continue its map with "
@@ -178,12 +163,7 @@ def _refuse_live_source(source: Source, resume: Path | None) -> None:
 def _unfinished(
     options: RunOptions, source: Source, resume: Path | None, lock: ExitStack
 ) -> Unfinished | None:
-    """Read the saved state of the run to resume. The result is None for a new run.
-
-    Raises:
-        InputError: there is no saved state, or the map to continue was made with a different
-            camera.
-    """
+    """Read the saved state of the run to resume. The result is None for a new run."""
     from vslam.run.autosave import find_unfinished, lock_run
     from vslam.run.pipeline import require_camera
 
@@ -239,7 +219,6 @@ def _recorder(
     moments: Recorder,
     pictures: LoopPictureRecorder,
 ) -> Recorder:
-    """Return a recorder for the recording file, the viewer and the report of a run."""
     from vslam.run.recorder import Recorder, RerunRecorder, SeveralRecorders
 
     recorders: list[Recorder] = []

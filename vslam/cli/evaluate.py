@@ -100,10 +100,8 @@ def evaluate_files(
 
 
 def _files_of_run(folder: Path, gt: Path | None, times: Path | None) -> tuple[Path, Path, str]:
-    """Return the files of the trajectory and of the ground truth of a run, and the alignment.
-
-    Both files have the same format.
-    """
+    """Return the files of the trajectory and of the ground truth of a run, and the alignment. Both
+    files have the same format."""
     from vslam.report.schema import ReportJson
     from vslam.run.outcome import alignment_of
     from vslam.trajectory import trajectory_format

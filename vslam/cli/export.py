@@ -224,10 +224,8 @@ def ros(
 
 
 def _beside(run: Path, name: str) -> Path:
-    """Return the default path of an exported file, which is in the folder of the run.
-
-    If ``run`` is a map file, the new path is in the folder of the map file, with the same stem.
-    """
+    """Return the default path of an exported file, in the folder of the run. If ``run`` is a map
+    file, the exported file is next to it and has the same stem."""
     return run / name if run.is_dir() else run.with_suffix(Path(name).suffix)
 
 
@@ -290,11 +288,8 @@ def _export_images(
     link: bool,
     quiet: bool,
 ) -> None:
-    """Write the images of the keyframes of a run into a new folder, and then the map.
-
-    The function ``save`` writes the map in the format of another program. Its arguments are the
-    folder, the map, the names of the images and the colours of the landmarks.
-    """
+    """Write the images of the keyframes of a run into a new folder. Then call ``save`` with the
+    folder, the map, the names of the images and the colours of the landmarks."""
     from vslam.maps.formats import landmark_colours, save_image
     from vslam.maps.new_output import new_output
 
@@ -322,7 +317,7 @@ def _export_images(
 
 
 def _image_of(frame: TimedFrame) -> NDArray[np.uint8]:
-    """Read the left image of a frame. The image is in colour if the source has colour images."""
+    """Read the left image of a frame, in colour if the source has colour images."""
     return frame.read(map)[0] if frame.colour is None else frame.colour()
 
 

@@ -16,8 +16,6 @@ _THEME = Theme({"option": "bold cyan"})
 
 
 class _Options(RegexHighlighter):
-    """Highlights option names in descriptions."""
-
     highlights = [r"(?P<option>(?<![\w-])--[a-z][a-z-]*)"]  # noqa: RUF012  # as rich declares it
 
 
@@ -38,7 +36,9 @@ def show_help(command: Any, context: Any) -> None:
         if not parameter.hidden and parameter.name != "help":
             is_option = parameter.param_type_name == "option"
             title = parameter.rich_help_panel or ("Options" if is_option else "Arguments")
-            panels.setdefault(title, []).append((_name(parameter), _described(parameter)))
+            panels.setdefault(title, []).append(
+                (_name_in_help(parameter), _description_with_default(parameter))
+            )
     for name, one in getattr(command, "commands", {}).items():
         if not one.hidden:
             summary = " ".join(one.help.split("\n\n")[0].split())
@@ -63,11 +63,11 @@ def describe_parameters(command: Any, context: Any) -> str:
             options.append("/".join((*parameter.opts, *parameter.secondary_opts)))
         else:
             about = Text.from_markup(parameter.help or "").plain
-            arguments.append(f"{context.command_path} takes {_name(parameter)}: {about}")
+            arguments.append(f"{context.command_path} takes {_name_in_help(parameter)}: {about}")
     return " ".join([*arguments, f"Its options are {', '.join(options)}."])
 
 
-def _name(parameter: Any) -> str:
+def _name_in_help(parameter: Any) -> str:
     """Return the name of a parameter in the help, such as ``--map FILE`` or ``RUN``."""
     if parameter.param_type_name == "argument":
         name = parameter.metavar or parameter.name.upper()
@@ -76,8 +76,7 @@ def _name(parameter: Any) -> str:
     return f"{names} {parameter.metavar}" if parameter.metavar else names
 
 
-def _described(parameter: Any) -> Text:
-    """Return the description of a parameter, followed by its default or by the word required."""
+def _description_with_default(parameter: Any) -> Text:
     text = Text.from_markup(parameter.help or "")
     default = parameter.default
     if isinstance(parameter.show_default, str):

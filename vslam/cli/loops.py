@@ -164,7 +164,6 @@ def bench(
 
 
 def _require_writable(out: Path) -> None:
-    """Check before any work begins that the output folder can be written."""
     try:
         there = next(path for path in (out, *out.absolute().parents) if path.exists())
         with TemporaryFile(dir=there):
@@ -176,7 +175,6 @@ def _require_writable(out: Path) -> None:
 
 
 def _write(out: Path, seed: int, **found: object) -> None:
-    """Write a report about the results obtained so far."""
     from vslam.lab.loopbench.report import write_report
     from vslam.lab.loopbench.schema import LoopsJson
     from vslam.machine import versions

@@ -49,11 +49,6 @@ _UsageError: Any = typer.BadParameter.__base__  # typer does not export it
 
 
 class _Command(TyperCommand):
-    """A command with vslam's own help.
-
-    If an option is wrong, the error message suggests a correction.
-    """
-
     def format_help(self, ctx: Any, formatter: Any) -> None:
         from vslam.cli.help import show_help
 
@@ -74,8 +69,6 @@ class _Command(TyperCommand):
 
 
 class _Group(TyperGroup):
-    """A group of commands with a common name, such as ``vslam map``, with vslam's own help."""
-
     def format_help(self, ctx: Any, formatter: Any) -> None:
         from vslam.cli.help import show_help
 
@@ -83,10 +76,8 @@ class _Group(TyperGroup):
 
 
 def _plain(message: str) -> str:
-    """Rephrase an error message of the parser in plain words.
-
-    For a misspelt name, a suggestion is added.
-    """
+    """Rephrase an error message of the parser in plain words. For a misspelt name, a suggestion is
+    added."""
     message = plain_reason(message)
     word, found, choices = message.partition(" is not one of ")
     if not found:
@@ -97,7 +88,7 @@ def _plain(message: str) -> str:
 
 
 def application(groups: Collection[ModuleType]) -> typer.Typer:
-    """Create a command line application from the commands that the given modules define."""
+    """Create a command-line application from the commands that the given modules define."""
     made = typer.Typer(
         help="Visual SLAM in pure Python.",
         cls=_Group,
@@ -128,7 +119,7 @@ app = application(_GROUPS)
 
 
 def _treat_as_ctrl_c(signal_number: int, stack: FrameType | None) -> None:
-    """Treat SIGTERM as Ctrl-C. The operating system sends SIGTERM when the machine shuts down."""
+    """The operating system sends SIGTERM when the machine shuts down."""
     handler = signal.getsignal(signal.SIGINT)
     if not callable(handler):  # background jobs of a shell ignore Ctrl-C
         raise KeyboardInterrupt
@@ -136,10 +127,7 @@ def _treat_as_ctrl_c(signal_number: int, stack: FrameType | None) -> None:
 
 
 def main() -> None:
-    """Run the command line.
-
-    If an input is wrong, one line is printed on stderr, and the exit code is 2.
-    """
+    """Run the command line. The exit code is 2 if an input is wrong."""
     # Imports and cached kernels create a million objects that stay alive. To search them for
     # garbage would take a tenth of the start-up time and another 0.16 s at the exit.
     gc.set_threshold(200_000, 20, 100)

@@ -174,10 +174,8 @@ def merge(
 
 
 def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
-    """Return the thresholds with which the first map was made.
-
-    If other maps were made with other thresholds, a message lists these maps.
-    """
+    """Return the thresholds of the first map. If other maps have other thresholds, a message lists
+    these maps."""
     from vslam.config import as_config
 
     thresholds = stored[0].thresholds

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 
 def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
-    """Return vslam's own names, followed by the names of plug-ins (docs/howto/plugins.md)."""
     return (*names, *(name for name in plugins.find_plugins(group) if name not in names))
 
 
@@ -166,7 +165,6 @@ def names_in(text: str) -> list[str]:
 
 
 def kitti_root() -> str:
-    """Return the default folder of the KITTI data."""
     return os.environ.get("KITTI_ROOT") or KITTI_ROOT
 
 
@@ -279,7 +277,6 @@ def _source_options(
         int | None, option(INPUT, "N", "Stop after N frames.", min=1, unset="all")
     ] = None,
 ) -> SourceOptions:
-    """Define the options that describe the source of the images."""
     from vslam.datasets.sources import SourceOptions
 
     if source is not None and data is not None:
@@ -303,10 +300,8 @@ _NAMES = {"SourceOptions": object}  # annotations whose types are slow to import
 def reads_source(
     *, without: tuple[str, ...] = ()
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorate a command that reads images.
-
-    The parameter ``given`` of the command is replaced by the options that describe the source of
-    the images.
+    """Decorate a command that reads images. The parameter ``given`` of the command is replaced with
+    the options that describe the source of the images.
 
     Args:
         without: names of the options to leave out.
@@ -348,11 +343,7 @@ def require_data(options: SourceOptions) -> None:
 
 
 def kind_of_source(options: SourceOptions) -> str:
-    """Return the kind of data that the options name, or detect it from the files.
-
-    Raises:
-        InputError: there are no data to read, or their kind is unknown.
-    """
+    """Return the kind of data that the options name, or detect it from the files."""
     from vslam.datasets.detection import detect_dataset
 
     require_data(options)
@@ -360,13 +351,8 @@ def kind_of_source(options: SourceOptions) -> str:
 
 
 def read_thresholds(given: str | None) -> Config:
-    """Read the thresholds of ``--config``.
-
-    ``given`` is a file, a text with values, or None for the defaults.
-
-    Raises:
-        InputError: the file cannot be read, or a name or value is not valid.
-    """
+    """Read the thresholds of ``--config``: a file, or a text with values. None gives the
+    defaults."""
     from vslam.config import Config, as_config, load_config
 
     if given is None:
@@ -379,13 +365,8 @@ def read_thresholds(given: str | None) -> Config:
 
 
 def open_given(options: SourceOptions, console: Console) -> Source:
-    """Open the source that the options describe.
-
-    If a synthetic town must be rendered first, the progress is shown.
-
-    Raises:
-        InputError: there are no data to read, or they cannot be read.
-    """
+    """Open the source that the options describe. If a synthetic town must be rendered first, the
+    progress is shown."""
     from vslam.datasets.sources import open_source
 
     require_data(options)

@@ -69,7 +69,6 @@ def report(
 
 
 def serve_runs(folders: list[Path], port: int) -> None:
-    """Serve a page of the runs in some folders until Ctrl-C."""
     from vslam.lab.overview.serve import make_server
 
     with make_server(folders, port) as server:
@@ -88,10 +87,8 @@ def write_overview_of(
     baseline: str | None = None,
     quiet: bool,
 ) -> None:
-    """Write the report about finished runs.
-
-    Unless ``quiet``, the first tables of the report and its path are printed.
-    """
+    """Write the report about finished runs. Unless ``quiet``, its first tables and its path are
+    printed."""
     from vslam.cli.tables import show_sections
     from vslam.lab.overview.render import write_overview
     from vslam.lab.overview.versus import versus

@@ -242,13 +242,8 @@ _WITH_RESUME = {"resume", "record", "view", "keep_open", "pages", "ply", "save_m
 
 
 def _refuse_with_resume(context: typer.Context) -> None:
-    """Refuse options that cannot be combined with ``--resume``.
-
-    A resumed run keeps these options.
-
-    Raises:
-        InputError: such an option was given.
-    """
+    """Refuse options that cannot be combined with ``--resume``, because a resumed run keeps its own
+    options."""
     for one in context.command.params:
         source = context.get_parameter_source(one.name or "")
         given = source is not None and source.name == "COMMANDLINE"
@@ -259,7 +254,8 @@ def _refuse_with_resume(context: typer.Context) -> None:
 
 
 def _antenna(text: str) -> tuple[float, float, float]:
-    """Parse the position of the antenna that ``--gps-antenna`` gives."""
+    """Parse the position of the antenna: metres to the right of, below and ahead of the left
+    camera."""
     try:
         right, down, ahead = map(float, text.split(","))
     except ValueError:
@@ -273,7 +269,6 @@ def _antenna(text: str) -> tuple[float, float, float]:
 
 
 def _compared(names: str, detector: str) -> tuple[str, ...]:
-    """Return the loop detectors that the option ``--compare`` lists, without repetitions."""
     from vslam.loopclosure.registry import require_detector
 
     found = tuple(names_in(names))
@@ -287,11 +282,10 @@ def _compared(names: str, detector: str) -> tuple[str, ...]:
 def _map_to_continue(
     file: Path, detector: DetectorName | None
 ) -> tuple[Path, DetectorName, dict[str, object]]:
-    """Read the detector and the thresholds with which the map to continue was made.
+    """Return the map file, and the detector and the thresholds with which the map was made.
 
-    ``file`` is a map file or the folder of a run that contains a map. The returned path of the map
-    is absolute. The reason is that ``runs/latest`` refers to a different folder as soon as this run
-    has created its folder.
+    The path of the map file is absolute, because ``runs/latest`` refers to a different folder as
+    soon as this run has created its folder.
     """
     from vslam.maps.storage import made_with, map_file_of
 

@@ -204,11 +204,8 @@ def foreign(
 
 
 def _fitting(laws: list[str], opened: Mapping[str, Source]) -> tuple[list[str], list[str]]:
-    """Find those perturbations that can be applied to every sequence.
-
-    Returns:
-        These perturbations, and a note for each perturbation that cannot be applied to a sequence.
-    """
+    """Return the perturbations that can be applied to every sequence, and a note about each of the
+    others."""
     from vslam.datasets.perturbation import laws_for
 
     notes: dict[str, None] = {}

@@ -17,10 +17,7 @@ _LOOK_AT = (("report", "report.html"), ("recording", "recording*.rrd"))
 
 
 def show_sections(sections: Iterable[Section]) -> None:
-    """Print sections of a report on stdout.
-
-    Long lines are wrapped only if stdout is a terminal.
-    """
+    """Print sections of a report on stdout. Long lines are wrapped only if stdout is a terminal."""
     from rich.console import Console
 
     from vslam.report.render import show
@@ -29,15 +26,12 @@ def show_sections(sections: Iterable[Section]) -> None:
 
 
 def print_rows(rows: Rows) -> None:
-    """Print names and values in two columns."""
     show_sections([Section("", [Pairs(rows)])])
 
 
 def print_summary(report: ReportJson, folder: Path) -> None:
-    """Print the first sections of the report of a run.
-
-    The most important files in the folder of the run are printed, too.
-    """
+    """Print the first sections of the report of a run, and the most important files in its
+    folder."""
     from vslam.report.run_page import run_page
     from vslam.run.autosave import MAP
 
@@ -52,10 +46,8 @@ def print_summary(report: ReportJson, folder: Path) -> None:
 
 
 def _how_to_compare(report: ReportJson) -> Rows:
-    """Return a hint on how to compare detectors.
-
-    The hint is empty if ``--compare`` was used or cannot be used, and if there is no ground truth.
-    """
+    """Return a hint on how to compare detectors. The hint is empty without ground truth, and if
+    ``--compare`` was used or cannot be used."""
     refused = report.realtime or report.map is not None  # --compare would be refused
     if report.detectors or report.compare or report.alignment is None or refused:
         return []

@@ -186,14 +186,8 @@ def train(
 
 
 def _require_libraries(command: str) -> None:
-    """Check that all packages of the extra ``train`` are installed.
-
-    This is checked at the start. Otherwise, a missing package such as onnxscript would be noticed
-    only after hours of training.
-
-    Raises:
-        InputError: a package is not installed.
-    """
+    """Check that all packages of the extra ``train`` are installed. Otherwise, a missing package
+    such as onnxscript would be noticed only after hours of training."""
     for name in ("torch", "safetensors", "onnx", "onnxscript"):
         if find_spec(name) is None:
             raise InputError(

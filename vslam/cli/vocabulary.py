@@ -53,7 +53,7 @@ def train(
     is_text(out)  # refuses an unknown suffix before the work begins
     if not out.parent.is_dir():
         raise InputError(f"{out}: the folder {out.parent} does not exist; create it.")
-    paths = _find(images)
+    paths = _find_images(images)
     descriptors, unreadable = [], 0
     shown = Console(shown=not quiet)
     with shown.count_bar("images", len(paths)) as advance:
@@ -135,11 +135,7 @@ def info(
         typer.echo(f"{name:<10}{value}")
 
 
-def _find(images: list[str]) -> list[Path]:
-    """Return the image files of all folders and glob patterns.
-
-    The files are sorted by name, and no file occurs twice.
-    """
+def _find_images(images: list[str]) -> list[Path]:
     import glob
 
     from vslam.datasets.image_files import is_image
@@ -160,10 +156,8 @@ def _find(images: list[str]) -> list[Path]:
 
 
 def _extract_all(paths: list[Path], config: OrbConfig) -> Iterator[NDArray[np.uint8] | None]:
-    """Yield the ORB descriptors of each image in order, as ``(n, 32)`` arrays.
-
-    None is yielded for an image that cannot be read.
-    """
+    """Yield the ``(n, 32)`` ORB descriptors of each image in order, or None if the image cannot be
+    read."""
     from concurrent.futures import ThreadPoolExecutor
 
     from vslam.datasets.image_files import read_grey

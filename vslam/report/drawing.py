@@ -1,8 +1,8 @@
 """The common style of the figures in reports, and functions that save figures as PNG and SVG.
 
 Every figure is drawn once, in the colours of a light theme. In the SVG, neutral colours are
-replaced by CSS variables. Therefore, a figure in the HTML page follows the light or dark theme of
-the reader.
+replaced with CSS variables, so that a figure in the HTML page follows the reader's light or dark
+theme.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ STYLE = {
     "ytick.color": LINE,
     "ytick.labelcolor": MUTED,
 }
-# Inches. Figures are so small that their text stays readable on a phone, which shrinks them to its
-# width.
+# Sizes in inches. Figures are small, so that their text stays readable on a phone, which shrinks
+# figures to the width of its screen.
 WIDTH, LOW, SQUARE = 4.6, 2.5, 5.4
 DOTS_PER_INCH = 200
 _LEGEND_CHARACTERS = 60  # number of characters that fit side by side
@@ -114,11 +114,8 @@ def plain_ticks(axis: Axis) -> None:
 
 
 def draw(drawings: Iterable[Drawing]) -> list[page.Figure]:
-    """Save figures in the style of reports.
-
-    If ``drawings`` is a generator, it creates its figures while this function runs. Therefore,
-    these figures have the same style.
-    """
+    """Save figures in the style of reports. A figure has this style only if ``drawings`` is a
+    generator that creates the figure while this function runs."""
     # after_reset ignores the user's matplotlibrc. Therefore, equal runs give equal figures.
     with style.context(STYLE, after_reset=True):
         return [save(*drawing) for drawing in drawings]

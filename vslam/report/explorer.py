@@ -29,15 +29,13 @@ if TYPE_CHECKING:
 def explorer(
     outcome: RunOutcome, evaluation: Evaluation | None, moments: Collection[Moment]
 ) -> list[Section]:
-    """Return the section of the report with the interactive explorer.
-
-    The section is empty if fewer than two frames were tracked.
+    """Return the section of the report with the interactive explorer, or nothing if fewer than two
+    frames were tracked.
 
     Args:
-        outcome: the outcome of the run.
         evaluation: errors of ``outcome.trajectory`` relative to the ground truth. None if they
             cannot be computed.
-        moments: images of keyframes, from a `vslam.run.moments.MomentRecorder`.
+        moments: images of keyframes, from a ``vslam.run.moments.MomentRecorder``.
     """
     data = explorer_data(outcome, evaluation, moments)
     if data is None:
@@ -51,18 +49,16 @@ def explorer(
 def explorer_data(
     outcome: RunOutcome, evaluation: Evaluation | None, moments: Collection[Moment]
 ) -> dict[str, Any] | None:
-    """Return the numbers and images for ``explorer.js``, in a form that can be written as JSON.
-
-    The result is None if fewer than two frames were tracked.
+    """Return the data for ``explorer.js``, in a form that can be written as JSON. The result is
+    None if fewer than two frames were tracked.
 
     ``floats`` contains times in seconds, positions in metres, headings in degrees (0 along z, 90
     along x) and errors in metres. Unknown numbers are NaN.
 
     Args:
-        outcome: the outcome of the run.
         evaluation: errors of ``outcome.trajectory`` relative to the ground truth. None if they
             cannot be computed.
-        moments: images of keyframes, from a `vslam.run.moments.MomentRecorder`.
+        moments: images of keyframes, from a ``vslam.run.moments.MomentRecorder``.
     """
     n = len(outcome.trajectory)
     if outcome.n_tracked < 2 or len(outcome.tracks) != n:
@@ -106,9 +102,5 @@ def _encoded(moment: Moment) -> dict[str, Any]:
 
 
 def _packed(values: NDArray[Any], kind: str) -> str:
-    """Encode an array in base64.
-
-    The encoded text is a third as long as the same numbers written as JSON. In contrast to JSON,
-    the encoded array may contain NaN.
-    """
+    """Encode an array in base64, which is a third as long as JSON and may contain NaN."""
     return b64encode(values.astype(kind).tobytes()).decode()

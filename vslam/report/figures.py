@@ -49,7 +49,6 @@ def draw_figures(
     """Draw all figures of the report for which the run has data.
 
     Args:
-        outcome: the outcome of the run.
         evaluation: errors of ``outcome.trajectory`` relative to the ground truth. None if they
             cannot be computed.
         verdict: comparison of ``outcome.loops`` with the ground truth. None if a frame has no
@@ -197,11 +196,9 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
 
 
 def _usable_features(outcome: RunOutcome) -> tuple[str, list[int]]:
-    """Return a name for the features that can become landmarks, and their number in each frame.
-
-    For a monocular camera, these are all features. For other cameras, they are the features with a
-    known depth.
-    """
+    """Return a name for the features that can become landmarks, and their number in each frame. For
+    a monocular camera, these are all features. For other cameras, these are the features with a
+    known depth."""
     sensor = outcome.sequence.camera.sensor
     if sensor == "mono":
         return "features", [track.n_features for track in outcome.tracks]
@@ -260,10 +257,7 @@ def _stage_colors(names: list[str]) -> list[str]:
 
 
 def _intervals(at: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Find the intervals in which an ``(N,)`` bool array is True.
-
-    Returns:
-        ``(M, 2)`` first and last index of each interval.
-    """
+    """Return the ``(M, 2)`` first and last indices of the intervals in which an ``(N,)`` bool array
+    is True."""
     steps = np.diff(np.concatenate([[False], at, [False]]).astype(np.int8))
     return np.stack([np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1], axis=1)

@@ -25,8 +25,10 @@ _WITHOUT_IMAGES = "export g2o, euroc or ply --no-colours, which need no images"
 class FinishedRun:
     """The content of the folder of a finished run.
 
-    ``map`` contains no culled keyframes. ``loops`` contains the closed loops, with the relative
-    poses that were measured when the loops were verified.
+    Attributes:
+        map: the map without culled keyframes.
+        loops: the closed loops, with the relative poses that were measured when the loops were
+            verified.
     """
 
     folder: Path
@@ -62,8 +64,7 @@ def open_images(
     """Open the images of a run again, with the options in its ``run.json``.
 
     Args:
-        data: the new location of the data if the data have been moved. If it is None, the location
-            in ``run.json`` is used.
+        data: the new location of the data if the data have been moved.
         on_render: function that is called while a synthetic sequence is rendered. Its arguments are
             the number of frames rendered so far and the total number.
 
@@ -89,7 +90,7 @@ def open_images(
 
 
 def keyframe_frames(run: FinishedRun, source: Source) -> Iterator[TimedFrame]:
-    """Return the frames that became keyframes of a run, in the order of the keyframes in the map.
+    """Yield the frames that became keyframes of a run, in the order of the keyframes in the map.
 
     Raises:
         InputError: the timestamps of the images differ from the timestamps of the run.

@@ -73,7 +73,8 @@ def create_run_folder(
 
 
 def _safe(part: str) -> str:
-    """Replace characters of a text so that it can be part of a file name."""
+    """Replace the characters of a text that should not be part of a file name, and limit its
+    length."""
     return re.sub(r"[^A-Za-z0-9.+=-]+", "_", part)[:_LONGEST_PART]
 
 
@@ -103,8 +104,6 @@ def write_results(
 
     Args:
         folder: an existing folder. Files of an earlier report are replaced.
-        outcome: the outcome of the run. The run may have lost all frames, or may have processed no
-            frames.
         moments: images of keyframes for the HTML page.
         pictures: pictures of closed loops. Some of them are written as
             ``figures/loop-<frame>-<frame>.jpg``.
@@ -131,10 +130,8 @@ def write_results(
 
 
 class Results:
-    """Writes the results of a run.
-
-    If one result cannot be written, the other results are still written.
-    """
+    """Writes the results of a run. If one result cannot be written, the other results are still
+    written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -142,10 +139,8 @@ class Results:
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Run the block as one part of the work.
-
-        If the block raises an exception, the exception is recorded and not passed on.
-        """
+        """Run a ``with`` block as one part of the work. If the block raises an exception, the
+        exception is recorded and not passed on."""
         try:
             yield
         except Exception as error:
@@ -153,10 +148,8 @@ class Results:
 
     @contextlib.contextmanager
     def file(self, name: str) -> Iterator[Path]:
-        """Yield the path at which to write a file or folder.
-
-        If writing fails, the file or folder is removed.
-        """
+        """Yield the path at which to write a file or folder. If writing fails, the file or folder
+        is removed."""
         path = self.folder / name
         with self.part(name):
             try:
@@ -199,11 +192,7 @@ def _reason(error: Exception) -> str:
 def _write_data(
     written: Results, outcome: RunOutcome, *, ply: bool, map_file: Path | None
 ) -> tuple[Evaluation | None, str | None]:
-    """Write trajectories, maps and tables, and return the result of ``evaluate_run``.
-
-    The evaluation also determines the transformation from the map to the ground truth, which is
-    stored in the map file.
-    """
+    """Write trajectories, maps and tables, and return the result of ``evaluate_run``."""
     write_trajectories(written, outcome)
     with written.file("keyframes.tum") as file:
         write_tum(file, outcome.keyframes)
@@ -240,7 +229,6 @@ def _write_data(
 
 
 def _write_gps(written: Results, outcome: RunOutcome) -> None:
-    """Write the georeferenced trajectory."""
     if (track := outcome.gps_track) is None:
         return
     with written.file("trajectory_enu.tum") as file:
@@ -265,11 +253,11 @@ def _config_text(outcome: RunOutcome) -> str:
 
 
 def write_trajectories(written: Results, outcome: RunOutcome) -> None:
-    """Write the final trajectory and the ground truth of its frames.
+    """Write the final trajectory and the ground truth of its frames, in the formats of KITTI and
+    TUM.
 
-    Both trajectories are written in the formats of KITTI and TUM. If some frames have no ground
-    truth, the ground truth is written only in TUM's format, because only this format has
-    timestamps.
+    If some frames have no ground truth, the ground truth is written only in TUM's format, because
+    only this format has timestamps.
     """
     with written.file("trajectory_kitti.txt") as file:
         write_kitti(file, outcome.trajectory.T_wc)
@@ -289,10 +277,8 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
 
 
 def _evo_command(folder: Path, outcome: RunOutcome, evaluation: Evaluation | None) -> str | None:
-    """Return the command that repeats the evaluation with evo.
-
-    The result is None if evo cannot evaluate this run.
-    """
+    """Return the command that repeats the evaluation with evo, or None if evo cannot evaluate this
+    run."""
     if evaluation is None or evaluation.on_one_line:
         return None
     if evaluation.frames == len(outcome.trajectory):
@@ -311,7 +297,6 @@ def _write_pages(
     moments: Collection[Moment],
     pictures: Collection[LoopPicture],
 ) -> None:
-    """Write the figures and the pages. The pages contain the figures that could be drawn."""
     from vslam.report.explorer import explorer
     from vslam.report.figures import draw_figures
     from vslam.report.loop_tables import seen_loops

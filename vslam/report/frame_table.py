@@ -20,9 +20,9 @@ _AXES = ("x", "y", "z", "rx", "ry", "rz")
 def write_frames(path: Path, tracks: list[TrackResult]) -> None:
     """Write ``frames.csv``, which has a row for each frame.
 
-    The first columns are the timestamp (s), the tracking state, several counts, and whether the
-    frame became a keyframe. Four standard deviations of position (m) and orientation (degrees)
-    follow. The last columns are the milliseconds of each stage.
+    The columns are the timestamp (s), the tracking state, several counts, whether the frame became
+    a keyframe, standard deviations of position (m) and orientation (degrees), and the milliseconds
+    of each stage.
 
     The first two standard deviations are relative to the landmarks around the camera. The other two
     are relative to the start of the drive. A field is empty if a standard deviation is unknown, or
@@ -79,9 +79,8 @@ def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
 def read_covariances(
     path: Path,
 ) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Read the two ``(6, 6)`` covariances of each frame from the file ``covariance.csv``.
-
-    The keys of the result are the timestamps, exactly as they are written in the file.
+    """Read the two ``(6, 6)`` covariances of each frame from the file ``covariance.csv``. The keys
+    are the timestamps, exactly as they are written in the file.
 
     Raises:
         InputError: the file is missing or damaged.

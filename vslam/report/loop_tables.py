@@ -25,11 +25,8 @@ _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def loop_sections(report: ReportJson) -> list[Section]:
-    """Create the sections about closed loops, revisits and rejected loop candidates.
-
-    Only the rejected candidates with the most inliers are listed. The reason for each rejection is
-    given.
-    """
+    """Create the sections about closed loops, revisits and rejected loop candidates. Of the
+    rejected candidates, only those with the most inliers are listed."""
     return [
         Section("Loops closed", [_closed(report)]),
         Section("Revisits", [_revisits(report)], wide=False),
@@ -124,12 +121,8 @@ def _evidence(loop: LoopEntry) -> Row:
 
 
 def _shared_reason(loops: list[LoopEntry]) -> str:
-    """Combine the reasons for rejecting several loops into one text.
-
-    The reasons differ only in their numbers.
-
-    The numbers are replaced by their ranges.
-    """
+    """Combine several reasons that differ only in their numbers. The numbers are replaced with
+    their ranges."""
     columns = zip(*(_NUMBER.findall(loop.reason) for loop in loops), strict=True)
     ends = [(min(column, key=float), max(column, key=float)) for column in columns]
     ranges = iter([low if low == high else f"{low}-{high}" for low, high in ends])
@@ -146,9 +139,8 @@ def _right_share(loops: list[LoopEntry]) -> str:
 
 
 def seen_loops(report: ReportJson, pictures: Collection[LoopPicture]) -> list[Figure]:
-    """Draw pictures of a few closed loops.
-
-    Wrong loops come first, followed by loops that were verified using learned descriptors.
+    """Draw pictures of a few closed loops. Wrong loops come first, followed by loops that were
+    verified using learned descriptors.
 
     Args:
         report: the content of ``report.json``, which lists the loops of the run.

@@ -1,8 +1,7 @@
 """The content of a page of results: sections of text, tables and figures.
 
 Every report of vslam is such a page. ``vslam.report.render`` writes a page as Markdown, as HTML and
-to a terminal. Each format omits the parts that it cannot show. Sections without parts are omitted,
-too.
+to a terminal. Each format omits the parts that it cannot show, and sections without parts.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ class Table:
 
     Attributes:
         head: a heading for each column.
-        the content. Each row has a cell for each column.
+        rows: the cells. Each row has a cell for each column.
         texts: the headings of the columns that contain text. Text is aligned to the left.
         note: explanation below the table.
     """
@@ -33,8 +32,6 @@ class Table:
 
 @dataclass(frozen=True)
 class Pairs:
-    """A list of names and their values."""
-
     rows: Sequence[tuple[str, str]]
 
 
@@ -56,14 +53,11 @@ class Tiles:
 
     @property
     def rows(self) -> list[tuple[str, str, str]]:
-        """The label, value and note of each number."""
         return [(tile.label, tile.value, tile.note) for tile in self.tiles]
 
 
 @dataclass(frozen=True)
 class Bullets:
-    """A list of sentences."""
-
     sentences: Sequence[str]
 
 

@@ -38,12 +38,8 @@ def write_files(
     """Write files into a folder, which is created if it does not exist.
 
     Args:
-        folder: the folder to write to.
         files: text or bytes by file name, in the order in which they are written.
         fix: advice to the user, which is added to the error message.
-
-    Raises:
-        ResultsError: a file cannot be written.
     """
     for name, content in files.items():
         write_file(folder / name, content, fix)
@@ -57,10 +53,8 @@ def csv_text(rows: Iterable[Sequence[object]]) -> str:
 
 
 def markdown(page: Page) -> str:
-    """Format a page as Markdown.
-
-    Its tables are aligned, so that they can also be read in a terminal.
-    """
+    """Format a page as Markdown. Its tables are aligned, so that they can also be read in a
+    terminal."""
     blocks = [f"# {page.title}", " · ".join(filter(None, page.about))]
     for section in page.sections:
         if parts := [text for part in section.parts if (text := _markdown_part(part))]:
@@ -129,7 +123,6 @@ def _heading_lines(name: str) -> list[str]:
 
 
 def _is_shown(part: Part) -> bool:
-    """Return whether a part of a page has any content."""
     match part:
         case Table() | Pairs():
             return bool(part.rows)
@@ -139,10 +132,7 @@ def _is_shown(part: Part) -> bool:
 
 
 def _is_wide(table: Table) -> bool:
-    """Return whether a table is too wide for a phone.
-
-    Headings and text may be broken at spaces.
-    """
+    """Return whether a table is too wide for a phone. Headings and text may be broken at spaces."""
     columns = zip(table.head, zip(*table.rows, strict=True), strict=True)
     width = 0
     for name, cells in columns:
@@ -178,7 +168,7 @@ def show(sections: Iterable[Section], console: Console) -> None:
                     if part.note:
                         say(part.note)
                 case Pairs() | Tiles():
-                    for line in _columns(part.rows):
+                    for line in _aligned_lines(part.rows):
                         console.out(line, highlight=False)
                 case Bullets():
                     for sentence in part.sentences:
@@ -189,8 +179,7 @@ def show(sections: Iterable[Section], console: Console) -> None:
                     say(part)
 
 
-def _columns(rows: Sequence[Row]) -> list[str]:
-    """Format rows as lines of text. Each column is as wide as its widest cell."""
+def _aligned_lines(rows: Sequence[Row]) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -199,12 +188,10 @@ def _columns(rows: Sequence[Row]) -> list[str]:
 
 
 def rich_table(table: Table, gap: int) -> RichTable:
-    """Create a ``rich`` table in which no cell is cut off.
-
-    Headings are broken at commas and brackets.
+    """Create a ``rich`` table in which no cell is cut off. Headings are broken at commas and
+    brackets.
 
     Args:
-        table: the cells.
         gap: number of spaces between two columns.
     """
     from rich import box

@@ -55,10 +55,8 @@ _ABOUT_COMPARED = (
 
 
 def headlines(report: ReportJson) -> list[Tile]:
-    """Create the summary of a run.
-
-    Lost frames come first, because the ATE means little if many frames were lost.
-    """
+    """Create the summary of a run. Lost frames come first, because the ATE means little if many
+    frames were lost."""
     lost, mono = report.lost_frames, report.sensor == "mono"
     share = f"{100.0 * lost / report.frames:.1f} % of" if lost else "of"
     alignment = _ALIGNMENTS[report.alignment] if report.alignment else ""
@@ -109,15 +107,13 @@ def _before_map(report: ReportJson) -> str:
 
 
 def _together(report: ReportJson) -> str:
-    """Return a remark that speed and memory were measured for several detectors together.
-
-    The remark is empty if the run used a single detector.
-    """
+    """Return a remark that speed and memory were measured for several detectors together, or "" for
+    a single detector."""
     return f", {len(report.detectors)} detectors together" if report.detectors else ""
 
 
 def advice(report: ReportJson) -> str:
-    """Return advice to the user if many frames were lost, and otherwise no advice."""
+    """Return advice to the user if many frames were lost, or else ""."""
     if report.lost_frames <= _MANY_LOST * report.frames:
         return ""
     return "Many frames were lost; vslam doctor checks images, calibration and timestamps."
@@ -146,10 +142,6 @@ def _on_earth(report: ReportJson) -> list[Tile]:
 
 
 def _latency(report: ReportJson) -> list[Tile]:
-    """Return the latency of a real-time run, for the summary.
-
-    The latency is marked as bad if frames were dropped, because the machine is then too slow.
-    """
     if report.latency_ms is None:
         return []
     ms, dropped = report.latency_ms, report.dropped_frames
@@ -175,7 +167,7 @@ def _loops(report: ReportJson) -> Tile:
 
 
 def _revisits(report: ReportJson) -> str:
-    """Return the number of revisits that were found by loops, for the summary.
+    """Return the number of revisits that were found by loops, as text.
 
     Only stretches of at least ``MIN_LENGTH_M`` count as revisits. If the drive has no such stretch,
     the text gives the number of correct loops on shorter stretches.
@@ -188,17 +180,15 @@ def _revisits(report: ReportJson) -> str:
 
 
 def detector_section(report: ReportJson) -> Section:
-    """Create a section that compares the detectors of a run with ``--compare``.
-
-    The table has a row for each detector. The detector of ``--detector`` comes first. The section
-    is empty for a run without ``--compare``.
+    """Create a section that compares the detectors of a run with ``--compare``. The section is
+    empty for a run without ``--compare``.
 
     Columns without any value are left out. The number of closed loops is shown only if there is no
     ground truth that shows which revisits were found.
     """
     detectors = report.detectors
     if not detectors:
-        return Section("Detectors", [_left_out(report)])
+        return Section("Detectors", [_why_comparison_is_missing(report)])
     known = {
         name for _, name, _ in _COMPARED if any(getattr(one, name) is not None for one in detectors)
     }
@@ -221,11 +211,7 @@ def detector_section(report: ReportJson) -> Section:
     )
 
 
-def _left_out(report: ReportJson) -> str:
-    """Return the reason why a comparison of detectors that was requested is missing.
-
-    The text is empty if no comparison is missing.
-    """
+def _why_comparison_is_missing(report: ReportJson) -> str:
     if report.detectors or not report.compare:
         return ""
     return (
@@ -307,10 +293,6 @@ def run_page(
 
 
 def _gps(report: ReportJson) -> Section:
-    """Create the section about the georeferenced trajectory.
-
-    The section is empty for a run without GPS.
-    """
     if (found := report.gps_track) is None:
         return Section("GPS", ())
     latitude, longitude, altitude = found.datum
@@ -337,10 +319,8 @@ def _gps(report: ReportJson) -> Section:
 
 
 def stage_rows(report: ReportJson) -> list[Row]:
-    """Return rows with the name of a stage and its mean, median, 95th and 99th percentile.
-
-    The times are in milliseconds.
-    """
+    """Return the name of each stage, and its mean, median, 95th and 99th percentile in
+    milliseconds."""
     return [
         (name, f"{ms.mean:.2f}", f"{ms.median:.2f}", f"{ms.p95:.2f}", f"{ms.p99:.2f}")
         for name, ms in report.stage_ms.items()
@@ -348,7 +328,7 @@ def stage_rows(report: ReportJson) -> list[Row]:
 
 
 def option_rows(report: ReportJson) -> list[tuple[str, str]]:
-    """Return rows with the options of the run, under their names on the command line."""
+    """Return the options of the run, under their names on the command line."""
     names = ("dataset", "sequence", "perturb", "detector", "sensor", "seed", "threads", "start")
     options = [(name, str(getattr(report, name))) for name in (*names, "every")]
     limit = "all" if report.max_frames is None else str(report.max_frames)
@@ -368,7 +348,6 @@ def option_rows(report: ReportJson) -> list[tuple[str, str]]:
 
 
 def machine_rows(report: ReportJson) -> list[tuple[str, str]]:
-    """Return rows that describe the machine, the packages and the time of the run."""
     machine = report.machine
     packages = {name: text for name, text in report.versions.items() if name != "python"}
     return [

@@ -22,10 +22,8 @@ class Record(BaseModel):
 
 
 class Document(Record):
-    """A JSON document of results.
-
-    A subclass sets ``schema_version`` to the version that it reads.
-    """
+    """A JSON document of results. A subclass sets ``schema_version`` to the version that it
+    reads."""
 
     schema_version: int
 
@@ -55,10 +53,8 @@ class Document(Record):
 
 
 class StageTime(Record):
-    """Time that one stage takes per frame, in milliseconds.
-
-    Only frames that went through the stage are included.
-    """
+    """Time that one stage takes per frame, in milliseconds. Only frames that went through the stage
+    are included."""
 
     mean: float
     median: float
@@ -96,11 +92,11 @@ class LoopEntry(Record):
 
 
 class RevisitEntry(Record):
-    """A range of frames in which the camera travels along an earlier part of its path again.
+    """A range of frames in which, according to the ground truth, the camera travels along an
+    earlier part of its path again.
 
-    The range is computed from the ground truth. ``loop_frame`` is the first frame of the range in
-    which a correct loop was closed. If no correct loop was closed in the range, ``loop_frame`` is
-    None.
+    ``loop_frame`` is the first frame of the range in which a correct loop was closed, or None if
+    there is no such frame.
     """
 
     first_frame: int
@@ -123,7 +119,7 @@ class Measures(Record):
     ``loops_missed`` is the number of revisited stretches without a correct loop. Without ground
     truth, ``loops_wrong``, ``loops_found`` and ``loops_missed`` are None.
 
-    ``interrupted`` is the reason why the run ended early. It is None if the run did not end early.
+    ``interrupted`` is the reason why the run ended early, or None if it did not end early.
     """
 
     lost_frames: int
@@ -145,7 +141,7 @@ class DetectorFigures(Measures):
 
     ``seconds`` is the wall time that this detector alone took. It includes tracking, waiting for
     mapping, and completing the map at the end. It excludes reading images and extracting features,
-    because these are done only once for all detectors.
+    which is done only once for all detectors.
     """
 
     detector: str
@@ -162,10 +158,9 @@ class MapFigures(Record):
       map. None if no frame was localised.
     - ``sought``: number of frames for which vslam searched the whole map for the pose.
     - ``found``: number of these searches that found a pose.
-    - ``error_m``: RMSE of the positions in the map, in metres. The trajectory of the run is not
-      aligned with the ground truth. Instead, the positions are transformed by the alignment of the
-      map. Therefore, a constant offset of all positions counts as an error. None if the map was not
-      aligned with a ground truth.
+    - ``error_m``: RMSE of the positions in the map, in metres, after the alignment of the map with
+      the ground truth. The run itself is not aligned, so a constant offset of all positions counts
+      as an error. None if the map was not aligned with a ground truth.
     """
 
     in_map_percent: float
@@ -203,10 +198,7 @@ class GpsFigures(Record):
 
 
 class Machine(Record):
-    """The machine on which the run was performed.
-
-    ``cores`` is the number of cores that the process may use.
-    """
+    """The machine of the run. ``cores`` is the number of cores that the process may use."""
 
     cpu: str
     cores: int
@@ -217,19 +209,20 @@ class Machine(Record):
 class ReportJson(Measures, Document):
     """The content of ``report.json``, which describes one run in numbers.
 
-    - ``frames``: number of processed frames. ``skipped_frames`` is the number of frames with an
-      image that could not be read. ``dropped_frames`` is the number of frames that were replaced by
-      a newer frame in a real-time run.
+    - ``frames``: number of processed frames.
+    - ``skipped_frames``: number of frames with an image that could not be read.
+    - ``dropped_frames``: number of frames that were replaced by a newer frame in a real-time run.
     - ``lost_before_map``: number of lost frames before the first tracked frame. Only a run that
-      begins a new map counts these frames. ``longest_loss_s`` is the longest time in seconds from a
-      lost frame to the next tracked frame, or to the end.
+      begins a new map counts these frames.
+    - ``longest_loss_s``: longest time in seconds from a lost frame to the next tracked frame, or to
+      the end.
     - ``warnings``: sentences about problems of the images or the rig that the run has detected.
     - ``evaluation_remark``: the reason why no errors were computed, or the number of frames that
       the errors cover.
     - ``latency_ms``: milliseconds from an image to its pose in a real-time run. None for other
       runs.
-    - ``loops_rejected``: number of rejected candidates. ``revisit_stretches`` is the sum of
-      ``loops_found`` and ``loops_missed`` (``vslam.evaluation.loops``).
+    - ``loops_rejected``: number of rejected candidates.
+    - ``revisit_stretches``: sum of ``loops_found`` and ``loops_missed``.
     - ``detectors``: the results of all detectors of a run with ``--compare``. The run's own
       detector comes first. The speed, CPU time and memory of such a run cover all detectors
       together. The list is empty in a resumed run, because the maps of the other detectors are not

@@ -53,7 +53,6 @@ def summarize(
     """Compute the content of ``report.json``.
 
     Args:
-        outcome: the outcome of the run.
         evaluation: errors of ``outcome.trajectory`` relative to the ground truth. None if they
             cannot be computed.
         verdict: comparison of ``outcome.loops`` with the ground truth. None if a frame has no
@@ -111,11 +110,8 @@ def summarize(
 
 
 def _scale_warnings(outcome: RunOutcome, evaluation: Evaluation | None) -> list[str]:
-    """Return a warning if the trajectory has a wrong scale.
-
-    The warning is given if the sensor measures the scale, but the trajectory fits the ground truth
-    only after it is scaled.
-    """
+    """Return a warning if the sensor measures the scale, but the trajectory fits the ground truth
+    only after it is scaled."""
     camera, ground_truth = outcome.sequence.camera, outcome.ground_truth
     if evaluation is None or ground_truth is None or camera.monocular:
         return []
@@ -161,9 +157,9 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
     """Compute the errors of the final trajectory of a run.
 
     Returns:
-        The errors and a remark. The errors are None if they cannot be computed, and the remark then
-        gives the reason. If the errors do not cover all frames, the remark gives the number of
-        frames that they cover. Otherwise, the remark is None.
+        The errors, or None if they cannot be computed, and a remark. The remark gives the reason
+        why there are no errors, or the number of frames that the errors cover. It is None if they
+        cover all frames.
     """
     ground_truth = outcome.ground_truth
     if ground_truth is None:
@@ -210,10 +206,6 @@ def _measures(
 def _detectors(
     outcome: RunOutcome, evaluation: Evaluation | None, verdict: LoopEvaluation | None
 ) -> list[DetectorFigures]:
-    """Compute the results of all detectors of a run with ``--compare``.
-
-    The detector of ``--detector`` comes first. The result is empty for a run without ``--compare``.
-    """
     if not outcome.compared:
         return []
     judged = [(outcome, evaluation, verdict)]
@@ -298,10 +290,8 @@ def _loops(outcome: RunOutcome, verdict: LoopEvaluation | None) -> list[LoopEntr
 
 
 def _frame(frames: NDArray[np.int64], keyframe: int) -> int | None:
-    """Return the index of the frame of this run that became a keyframe.
-
-    The result is None if the keyframe number is -1 or belongs to an earlier drive.
-    """
+    """Return the frame of this run that became a keyframe, or None if the keyframe is -1 or belongs
+    to an earlier drive."""
     return int(frames[keyframe]) if keyframe >= 0 and frames[keyframe] >= 0 else None
 
 
@@ -338,7 +328,6 @@ def _stage_time(ms: list[float]) -> StageTime:
 
 
 def this_machine() -> Machine:
-    """Describe the machine on which this process runs."""
     return Machine(
         cpu=cpu_name(),
         cores=available_cores(),

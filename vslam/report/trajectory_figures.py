@@ -104,8 +104,8 @@ def top_view(
 def loop_closing(outcome: RunOutcome, evaluation: Evaluation | None) -> Figure:
     """Draw the positions of keyframes before the first loop closure and at the end of the run.
 
-    Both sets of positions are transformed to the frame of the ground truth by the alignment of the
-    final trajectory. Therefore, all differences between the two sets are caused by loop closing.
+    Both sets of positions are transformed to the ground-truth frame by the alignment of the final
+    trajectory. Therefore, all differences between them are caused by loop closing.
     """
     figure, axes = _new_map("Map before and after loop closing", outcome, evaluation)
     before = _aligned(outcome, evaluation, _centres(outcome.corrections[0].T_cw_before))
@@ -165,20 +165,16 @@ def _centres(T_cw: NDArray[np.float64]) -> Points:
 
 
 def _lines(ends: Points) -> Collection[Points]:
-    """Convert ``(M, 2, 3)`` line segments to the x and z of one polyline.
-
-    The segments are separated by NaN.
-    """
+    """Convert ``(M, 2, 3)`` line segments to the x and z of one polyline, in which the segments are
+    separated by NaN."""
     gaps = np.full((len(ends), 1, 3), np.nan)
     points = np.concatenate([ends, gaps], axis=1).reshape(-1, 3)
     return points[:, 0], points[:, 2]
 
 
 def _at_frames(outcome: RunOutcome, path: Points, frames: NDArray[np.int64]) -> Points:
-    """Return the ``(F, 3)`` positions of some frames of the run.
-
-    ``path`` contains the positions of all frames.
-    """
+    """Return the ``(F, 3)`` positions of some frames of the run. ``path`` contains the positions of
+    all frames."""
     times = np.array([outcome.tracks[k].timestamp for k in frames])
     index = np.searchsorted(outcome.trajectory.timestamps, times)
     return path[np.minimum(index, len(path) - 1)]

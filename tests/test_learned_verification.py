@@ -1,4 +1,4 @@
-"""Loops are verified by learned local descriptors, from another viewpoint and in other light."""
+"""Loops are verified by learned local descriptors, from other viewpoints and in other light."""
 
 from __future__ import annotations
 
@@ -31,10 +31,7 @@ CONFIG = Config()
 
 
 def wall(seed: int) -> np.ndarray:
-    """Make a painted wall of 40 by 16 metres with 80 pixels per metre.
-
-    It has rectangles, lines and spots.
-    """
+    """Make a painted wall of 40 by 16 metres with 80 pixels per metre."""
     rng = np.random.default_rng(seed)
     image = np.full((1280, 3200), 128, np.uint8)
     for _ in range(900):

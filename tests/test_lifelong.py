@@ -27,10 +27,7 @@ def view(k: int) -> Features:
 
 @cache
 def laps(known_after_s: float, threads: int = 1) -> tuple[Slam, tuple[int, ...], list]:
-    """Drive five laps of the ring, 21 s each.
-
-    Returns the number of keyframes that exist after each lap.
-    """
+    """Track five laps of the ring, 21 s each. Return the number of keyframes after each lap."""
     config = Config.model_validate({"keyframes": {"known_after_s": known_after_s}})
     slam = Slam(CAMERA, config, Oracle(RING, PLACES), threads=threads)
     keyframes, results = [], []
@@ -70,10 +67,7 @@ def test_known_streets_give_the_same_bytes_with_one_thread_and_two():
 
 
 def with_some_of(features: Features, other: Features, n: int) -> Features:
-    """Return features together with n features of a different view.
-
-    This simulates a street that looks repetitive.
-    """
+    """Add n features of a different view, as on a street that looks repetitive."""
     some = np.linspace(0, len(other) - 1, n).astype(int)
     names = ("xy", "octave", "angle", "descriptors", "u_right")
     columns = ((getattr(features, name), getattr(other, name)) for name in names)

@@ -53,10 +53,7 @@ def imagenet_state(seed: int = 0) -> dict[str, torch.Tensor]:
 
 
 def reference(state: dict[str, torch.Tensor], images: torch.Tensor) -> torch.Tensor:
-    """Compute the published network on colour images ``(x - 127) / 128``.
-
-    The padding is that of TensorFlow.
-    """
+    """Compute the published network on colour images ``(x - 127) / 128``, with its padding."""
 
     def layer(x, conv, norm, stride=1, groups=1, active=True):
         weight = state[f"{conv}.weight"]
@@ -90,9 +87,9 @@ def imagenet(tmp_path: Path) -> Path:
 @pytest.mark.slow
 @torch.no_grad()
 def test_the_published_network_is_computed(imagenet):
-    """The input are grey images with a standard deviation of 1.
+    """The network gets grey images with a standard deviation of 1.
 
-    The output must equal that of the published network at a standard deviation of 0.5.
+    Its output must equal that of the published network at a standard deviation of 0.5.
     """
     extractor = LiteExtractor()
     extractor.load_imagenet(imagenet)

@@ -60,10 +60,7 @@ class World:
     def add_keyframe(
         self, T_cw: np.ndarray, *, mono: bool = False, noise: float = 0.0, among=None
     ) -> int:
-        """Add a keyframe that sees every point, or only those in ``among``.
-
-        The features of its image are in random order.
-        """
+        """Add a keyframe that sees every point, or only those in ``among``, in random order."""
         in_camera = transform(T_cw, self.points)
         uvr = CAMERA.project(np.where(in_camera[:, 2:] > 0.5, in_camera, 1.0))
         uvr += noise * white_noise(self.rng, np.full(len(uvr), not mono))
@@ -117,10 +114,7 @@ class World:
         return landmark_of
 
     def point_of_landmark(self, landmark: int) -> set[int]:
-        """Return the points that a landmark observes.
-
-        It is a single point, unless the map has confused points.
-        """
+        """Return the points that a landmark observes. A correct landmark observes one point."""
         rows = np.flatnonzero(self.map.arrays.landmark[: self.map.n_rows] == landmark)
         return set(self.point_of_row[rows].tolist())
 

@@ -36,7 +36,7 @@ def new(threads: int = 1) -> Slam:
 
 
 def drive(slam: Slam, ring: Ring, places, seed: int, start: float = 0.0) -> list[TrackResult]:
-    """Drive at ten frames per second. None stands for a black image."""
+    """Track ten frames per second. None stands for a black image."""
     results = [
         slam.step_features(NOTHING if k is None else Extracted(ring.see(k, seed)), start + 0.1 * i)
         for i, k in enumerate(places)
@@ -64,7 +64,6 @@ def everything(slam: Slam) -> bytes:
 
 @pytest.fixture(scope="module")
 def file(ring, tmp_path_factory) -> Path:
-    """A map file of the first 100 places of the ring."""
     slam = new()
     drive(slam, ring, range(100), seed=0)
     path = tmp_path_factory.mktemp("maps") / "ring.npz"
@@ -87,10 +86,7 @@ def test_localising_finds_every_frame_and_changes_nothing(file, ring):
 
 
 def test_localising_backwards_through_the_map_looks_around_where_it_is(file, ring):
-    """The reference keyframe follows the camera.
-
-    It does not stay the keyframe at which the camera was relocalised.
-    """
+    """The reference keyframe follows the camera."""
     slam = Slam.load(file, threads=1, localize=True)
     places = [80 - 0.5 * k for k in range(120)]
     results = drive(slam, ring, places, seed=2)
@@ -276,7 +272,6 @@ def refusal(*words: object) -> str:
 
 @pytest.fixture(scope="module")
 def mapped(kitti_tree, tmp_path_factory) -> Path:
-    """A run over the first 20 frames of the corridor."""
     out = tmp_path_factory.mktemp("mapped")
     words = ("--data", kitti_tree, "--no-record", "--no-report", "--quiet", "--out", out)
     result = vslam("run", *words, "--max-frames", 20, "--save-map", out / "kept.npz")

@@ -73,10 +73,7 @@ while entered < 100:
 
 @pytest.mark.slow
 def test_processes_that_race_get_in_one_at_a_time(tmp_path):
-    """When a process releases the lock, it removes the file.
-
-    Other processes may have opened this file just before.
-    """
+    """A process that releases the lock removes a file that others may have opened just before."""
     command = [sys.executable, "-c", RACER, str(tmp_path)]
     racers = [subprocess.Popen(command) for _ in range(4)]
     assert [racer.wait(timeout=300) for racer in racers] == [0] * 4

@@ -28,7 +28,6 @@ def moved_poses(keyframes) -> np.ndarray:
 
 
 def reprojection(world: World, keyframe: int, landmarks: np.ndarray) -> np.ndarray:
-    """Return ``(N, 3)`` projections of landmarks into a keyframe."""
     a = world.map.arrays
     return CAMERA.project(transform(a.T_cw[keyframe], a.xyz[landmarks]))
 

@@ -96,10 +96,7 @@ def result(frame: int) -> TrackResult:
 
 
 def told(frames: list[int]) -> LoopPictureRecorder:
-    """Make a recorder that has seen these keyframes.
-
-    The brightness of each image is the number of its keyframe.
-    """
+    """Make a recorder that has seen these keyframes. The brightness of an image is its number."""
     pictures = LoopPictureRecorder()
     pictures.begin(CAMERA, None)
     for frame in frames:

@@ -233,7 +233,7 @@ def test_a_sequence_is_the_mean_along_the_best_line():
 
 @pytest.mark.slow
 def test_a_sequence_outvotes_an_image_that_looks_like_all(vocabulary):
-    """The route is driven again, but one gallery image is the most similar image of every query."""
+    """The same route is queried, but one gallery image is the most similar one for every query."""
     n = 30
     relation = np.where(np.eye(n) > 0, SAME, DIFFERENT).astype(np.int8)
     p = np.full((n, n), 0.1) + 0.6 * np.eye(n)

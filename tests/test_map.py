@@ -257,10 +257,7 @@ def test_pose_of_a_keyframe_is_a_copy():
 
 @pytest.mark.slow
 def test_a_long_chain_of_culled_keyframes_still_has_poses():
-    """If the camera stands still, thousands of keyframes are culled.
-
-    Each is the parent of the next.
-    """
+    """If the camera stands still, thousands of keyframes are culled."""
     rng = np.random.default_rng(0)
     map_ = Map(SCALES)
     for _ in range(1500):

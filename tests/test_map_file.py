@@ -32,7 +32,6 @@ CONFIG = Config()
 
 
 def driven(slam: Slam, ring: Ring, places, start: float = 0.0) -> Slam:
-    """Drive along the ring at ten frames per second."""
     for i, k in enumerate(places):
         slam.step_features(Extracted(ring.see(k, seed=int(start))), start + 0.1 * i)
     slam.finish()
@@ -172,10 +171,7 @@ def test_loops_images_drives_and_world_come_back(slam, tmp_path):
 
 
 def test_what_the_detector_knew_comes_back(slam, file, ring):
-    """The detector finds the same candidates with the same scores.
-
-    It need not look up the words again.
-    """
+    """The candidates have the same scores, and the words need not be looked up again."""
     again = create_detector("bow", CONFIG)
     stored = load_map(file)
     again.restore(stored.detector)

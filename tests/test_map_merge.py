@@ -40,10 +40,7 @@ def ring() -> Ring:
 
 @pytest.fixture(scope="module")
 def drives(ring) -> list[StoredMap]:
-    """Three drives: the first meets the third, and the third meets the second.
-
-    Each drive has its own world frame.
-    """
+    """Three drives with their own world frames. The third one overlaps with both others."""
     parts = (range(80), range(110, 180), range(55, 130))
     return [driven(ring, part, seed) for seed, part in enumerate(parts)]
 
@@ -62,10 +59,7 @@ def frames_of(drives: list[StoredMap], starts: list[int]) -> list[np.ndarray]:
 
 
 def errors(map_, ring: Ring, starts: list[int]) -> np.ndarray:
-    """Return how far each keyframe is from its true position, in metres.
-
-    Positions are in the world of the first drive.
-    """
+    """Return the position error of each keyframe in metres, in the world of the first drive."""
     places = [starts[s] + f for s, f in zip(map_.sessions, map_.frames, strict=True)]
     true = np.array([inverse(ring.pose(starts[0])) @ ring.pose(k) for k in places])
     T_wc = inverses(map_.arrays.T_cw[: map_.n_keyframes])

@@ -80,7 +80,7 @@ def see_points(k: int) -> Features:
 
 
 def at(k: int) -> np.ndarray:
-    """Return ``T_cw`` of a camera that drives ahead by 0.2 m per frame."""
+    """Return ``T_cw`` of a camera that moves ahead by 0.2 m per frame."""
     return ahead(0.2 * k, 0.002 * k)
 
 
@@ -109,7 +109,7 @@ class Drive:
         self._see, self._at = see, poses
 
     def next_frame(self) -> Frame:
-        """Return the next frame at its true pose. It is tracked in the mapper's view of the map."""
+        """Return the next frame at its true pose, tracked in the mapper's view of the map."""
         k, mapper = len(self.mapper.frames), self.mapper
         frame = frame_of(self._see(k), k, 0.1 * k, camera=self.context.camera)
         frame.T_cw = self._at(k)
@@ -139,7 +139,6 @@ class Drive:
 
 
 def bytes_of_view(view: MapView) -> bytes:
-    """Return everything that a view of the map shows, as bytes."""
     values = (getattr(view, field.name) for field in fields(view))
     arrays = (x for value in values for x in (value if isinstance(value, tuple) else (value,)))
     return b"".join(np.ascontiguousarray(x).tobytes() for x in arrays)
@@ -213,10 +212,9 @@ def test_a_keyframe_merges_the_one_before():
 
 
 def trace_on_the_ring(workers, look: Callable[[Mapper], object] = lambda mapper: None) -> list:
-    """Drive on the ring with noisy features.
+    """Return what tracking sees at each frame of the ring, and the final map.
 
-    Returns what tracking sees at each frame, and the final map. ``look`` is called after each
-    frame.
+    The features are noisy. ``look`` is called after each frame.
     """
     drive = Drive(
         workers,
@@ -317,10 +315,7 @@ MOVES = [se3_exp(np.array(twist)) for twist in ([0.3, 0, 0, 0, 0.02, 0], [0, 0, 
 
 @late_and_early
 def test_held_frames_follow_a_merge(workers):
-    """A placed frame follows its keyframe.
-
-    A frame that is not placed follows the reference keyframe.
-    """
+    """A frame that is not placed follows the reference keyframe."""
 
     def move(map_: Map, keyframe: int) -> None:
         for k in range(keyframe + 1 if keyframe else 0):
@@ -386,7 +381,6 @@ def monocular_drive(workers, closing: Closing) -> Drive:
 
 
 def begin_with_two_views(drive: Drive) -> None:
-    """Begin the map with the frames 0 and 3."""
     frames = []
     for _ in range(4):
         frames.append(drive.next_frame())
@@ -414,7 +408,6 @@ def test_a_monocular_map_begins_with_two_keyframes():
 
 
 def drive_twist(k: int) -> np.ndarray:
-    """Return the ``(6,)`` twist from frame 0 to frame k."""
     return np.array([0.0, 0.0, -0.2 * k, 0.0, -0.002 * k, 0.0])
 
 
@@ -448,9 +441,9 @@ def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_
 
 @pytest.mark.parametrize("adjusting", [False, True])
 def test_where_culled_landmarks_are_dropped_frames_track_the_same_points(adjusting, monkeypatch):
-    """Culled landmarks are not dropped during a global bundle adjustment.
+    """Global bundle adjustment refers to landmarks by their numbers.
 
-    It refers to landmarks by their numbers.
+    Therefore, culled landmarks are not dropped while it runs.
     """
 
     def kill(map_: Map, keyframe: int) -> None:
@@ -524,10 +517,7 @@ def test_a_place_is_old_when_its_keyframe_is(known_after_s, known):
 
 @pytest.mark.parametrize("is_due", [False, True])
 def test_an_old_keyframe_can_serve_in_place_of_a_new_one(is_due):
-    """The old keyframe also counts for the merge of a global bundle adjustment.
-
-    If its result is due, it is merged as with a new keyframe.
-    """
+    """It also counts for the merge of a global bundle adjustment whose result is due."""
     drive = Drive(known_after_s=0.3)
     drive.steps([0, 3], 6)
     mapper, frame = drive.mapper, drive.last
@@ -570,7 +560,7 @@ INCOMPLETE = r"^mapping [^.]*failed [^.]*incomplete; continue from a map that wa
 
 
 class BrokenError(Exception):
-    """The error that a failing mapping job raises in these tests."""
+    """The error of a mapping job."""
 
 
 def fail(map_: Map, keyframe: int) -> None:
@@ -680,8 +670,6 @@ def test_a_map_that_is_incomplete_is_not_saved(failing, threads, tmp_path, monke
 
 def test_a_detector_that_fails_costs_its_loops_alone(tmp_path, caplog):
     class Detector(NoDetector):
-        """A detector that fails at each keyframe."""
-
         def add(self, keyframe, image, features):
             raise BrokenError
 
@@ -703,10 +691,7 @@ def test_a_detector_that_fails_costs_its_loops_alone(tmp_path, caplog):
 
 
 def test_a_mapper_that_is_restored_goes_on_as_the_one_that_was_not():
-    """The reference keyframe is not the newest keyframe.
-
-    This happens after a frame was relocalised in the map.
-    """
+    """The reference keyframe is not the newest one, as after relocalisation."""
     one = Drive()
     one.steps([0, 3], 6)
     one.mapper.append_pose(one.next_frame(), tracked=True, near=0)

@@ -1,7 +1,4 @@
-"""Masked pixels give no feature, no patch and no place.
-
-Runs without masks have no additional cost.
-"""
+"""Masked pixels give no feature, no patch and no place. Runs without masks are not slower."""
 
 from __future__ import annotations
 
@@ -34,7 +31,6 @@ HOOD = 110  # first row that the hood covers
 
 @pytest.fixture(scope="module")
 def mask(corridor) -> np.ndarray:
-    """A mask that is white above the hood and black on the hood."""
     mask = np.full(corridor.left[0].shape, 255, np.uint8)
     mask[HOOD:] = 0
     return mask

@@ -25,7 +25,6 @@ def random_descriptors(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def with_flips(rng: np.random.Generator, descriptors: np.ndarray, bits: int) -> np.ndarray:
-    """Return copies of descriptors with ``bits`` random bits flipped in each."""
     flat = np.unpackbits(descriptors.view(np.uint8), axis=1)
     for row in flat:
         row[rng.choice(256, bits, replace=False)] ^= 1

@@ -37,10 +37,7 @@ class Building(Drive):
         return drive
 
     def placed_frame(self, *, tracked: bool = True) -> Frame:
-        """Return the next frame after it is placed.
-
-        A frame that is not tracked has no landmarks.
-        """
+        """Return the next frame after it is placed. If it is not tracked, it has no landmarks."""
         frame = self.next_frame()
         if not tracked:
             frame.landmark[:], frame.xyz[:] = -1, np.nan
@@ -65,10 +62,7 @@ def found(frame: Frame) -> Found:
 
 
 def test_localising_leaves_the_map_alone():
-    """The map is byte-identical afterwards.
-
-    This includes the counts of how often landmarks were seen.
-    """
+    """The map is byte-identical, including the counts of how often landmarks were seen."""
     drive = Building.with_a_map()
     mapper, mode = drive.mapper, Mode(drive.mapper)
     lost, tracked = drive.lost_frame(10), drive.placed_frame()
@@ -137,10 +131,7 @@ def test_a_monocular_map_begins_with_the_second_view():
 
 @pytest.mark.parametrize("twist", [TWIST, None])
 def test_a_sub_map_is_placed_by_the_prediction_if_the_speed_is_known(twist):
-    """The frame tracks no landmark of the previous map.
-
-    It may have tracked some when it was lost.
-    """
+    """The frame tracks no landmark of the previous map, but may have tracked some before."""
     drive = Building.with_a_map()
     drive.tracker.resume(twist)
     frame = drive.placed_frame()
@@ -154,10 +145,7 @@ def test_a_sub_map_is_placed_by_the_prediction_if_the_speed_is_known(twist):
 
 @pytest.mark.parametrize(("young_keyframes", "patience"), [(2, 1), (1, 3)])
 def test_a_lost_stereo_camera_begins_a_sub_map_sooner_in_a_young_map(young_keyframes, patience):
-    """A map with two keyframes is young.
-
-    There, a sub-map begins after one lost frame. Otherwise, it begins after three.
-    """
+    """A young map (two keyframes) waits for one lost frame, and an older map for three."""
     drive = Building.with_a_map(tracking={"young_keyframes": young_keyframes})
     for n in range(1, patience + 1):
         begun = drive.mode.begin_after_loss(drive.lost_frame(1))

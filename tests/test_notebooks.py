@@ -16,7 +16,7 @@ FRAMES = 16  # in place of 40: rendering them is most of the time
 
 
 def executed(path: Path):
-    """The notebook after it was executed on few frames."""
+    """Return the notebook after it was executed on few frames."""
     notebook = nbformat.read(path, as_version=4)
     for cell in notebook.cells:
         if cell.cell_type == "code":

@@ -50,8 +50,6 @@ def no_bar(what: str, total: int):
 
 
 class Scores:
-    """A detector that returns the scores that it was given."""
-
     name, probability = "told", False
 
     def __init__(self, scores) -> None:
@@ -270,10 +268,7 @@ def texture(seed: int, height: int = 188, width: int = 620) -> np.ndarray:
 
 
 def write_drive(folder, places) -> ImageSource:
-    """Write a drive along textures.
-
-    Each place has a texture, and equal places have the same one.
-    """
+    """Write a drive along textures. Equal places have the same texture."""
     files = []
     for k, place in enumerate(places):
         files.append(folder / f"{k:06d}.png")

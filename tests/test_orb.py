@@ -27,10 +27,7 @@ from vslam.frontend.orb import (
 
 
 def textured(height: int = 240, width: int = 320, seed: int = 0) -> np.ndarray:
-    """Make blocks of random grey values, slightly blurred.
-
-    They have many corners of every strength.
-    """
+    """Make slightly blurred blocks of random grey values, with corners of every strength."""
     rng = np.random.default_rng(seed)
     blocks = rng.uniform(0, 255, (height // 8 + 1, width // 8 + 1))
     image = np.kron(blocks, np.ones((8, 8)))[:height, :width]
@@ -154,8 +151,7 @@ def test_no_two_corners_touch_and_none_is_near_the_border():
 def clustered(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Make an image with 3,000 strong corners in a small area and 300 weak corners elsewhere.
 
-    The strong corners are in a cluster of 60 x 60 px. The weak corners are spread over 640 x 240
-    px.
+    The strong corners are in a cluster of 60 x 60 px. The weak ones are spread over 640 x 240 px.
     """
     rng = np.random.default_rng(seed)
     dense = np.stack([rng.integers(300, 360, 3000), rng.integers(90, 150, 3000)], axis=1)

@@ -40,7 +40,6 @@ LAWS = ("none", "brightness:0.5", "brightness:1")
 
 
 def copy_run(source: Path, folder: Path, **changes: object) -> Path:
-    """Write a further run that has the trajectory of ``source``."""
     folder.mkdir(parents=True)
     for name in ("trajectory.tum", "trajectory_kitti.txt", "ground_truth_kitti.txt", "config.json"):
         shutil.copy(source / name, folder)
@@ -108,7 +107,6 @@ def entry(
 
 
 def table_of(report: OverviewJson, title: str) -> Table:
-    """Return the table in a section of the page."""
     (section,) = (one for one in overview_page(report, []).sections if one.title == title)
     (table,) = section.parts
     return table
@@ -230,10 +228,7 @@ def test_too_few_sequences_for_a_test_are_said(written):
 
 
 def test_wilcoxon_pairs_sequences_not_runs():
-    """There are six sequences with three runs each.
-
-    Therefore, n is 6, and p is the smallest value that is possible with 6 pairs.
-    """
+    """There are six sequences with three runs each. p has the smallest value for 6 pairs."""
     assert least_pairs() == 6
     runs = [
         entry(
@@ -288,7 +283,7 @@ def loops(found: int, missed: int, lost: int = 0, rpe: float = 0.02) -> dict[str
 def two_conditions() -> list[RunEntry]:
     """Runs on six sequences.
 
-    ``both`` closes the loop of each sequence under brightness, and ``bow`` closes no loop.
+    Under brightness, ``both`` closes the loop of each sequence, and ``bow`` closes no loop.
     """
     runs = []
     for name in (f"{k:02d}" for k in range(6)):
@@ -584,7 +579,6 @@ def test_a_report_of_an_unknown_town_is_left_out_with_a_note(run_folder: Path, t
 
 @pytest.fixture(scope="module")
 def monocular(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run whose trajectory is right except for its unit, as in a monocular run."""
     folder = copy_run(
         run_folder, tmp_path_factory.mktemp("mono") / "mono", sensor="mono", detector="bow",
         perturb="none", alignment="sim3", ate_rmse_m=0.25,
@@ -696,9 +690,9 @@ page.src = "report.html";
 
 @pytest.mark.slow
 def test_report_in_a_browser_as_wide_as_a_phone(written, tmp_path: Path):
-    """In Chromium at a width of 400 px, all figures are drawn.
+    """At a width of 400 px, all figures are drawn, and nothing is wider than the page.
 
-    Nothing is wider than the page. The page requests nothing from the network.
+    The page makes no network requests.
     """
     chromium()
     served = tmp_path / "served"

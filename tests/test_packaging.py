@@ -35,10 +35,7 @@ def build(source: Path, out: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two wheels that were built from copies in different folders.
-
-    The files have different times.
-    """
+    """Two wheels, built from copies in different folders whose files have different times."""
     root = tmp_path_factory.mktemp("wheels")
     made = []
     for number in range(2):

@@ -36,7 +36,6 @@ def coarse(image):
 
 @pytest.fixture(scope="module")
 def points(corridor):
-    """Return the stereo points of the first frame in the world."""
     context = TrackingContext.create(corridor.camera, CONFIG)
     images = FrameImages(corridor.left[FIRST], lambda: corridor.right[FIRST], context)
     features = images.extracted.features
@@ -137,10 +136,7 @@ def test_image_alignment_that_follows_a_moving_object_is_not_believed(corridor, 
 
 
 def run(kitti_tree, threads=1, sequence=None):
-    """Run patch-based tracking over the files of the corridor.
-
-    Reads of the right image are counted.
-    """
+    """Track the corridor by patches. Reads of the right image are counted."""
     sequence = sequence or open_sequence("kitti", kitti_tree, "00")
     reads = []
 

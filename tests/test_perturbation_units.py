@@ -29,10 +29,7 @@ def texture(seed: int, shape: tuple[int, int] = (160, 480)) -> np.ndarray:
 
 
 def wall(metres: float) -> tuple[np.ndarray, np.ndarray]:
-    """Make a stereo pair that shows a wall, which faces the cameras.
-
-    The distance of the wall is such that its disparity is a whole number.
-    """
+    """Make a stereo pair of a wall that faces the cameras. Its disparity is a whole number."""
     d = CAMERA.bf / metres
     assert d == round(d)
     wide = texture(2)
@@ -172,10 +169,7 @@ def test_a_blackout_lasts_its_time_whatever_the_frame_rate(ms):
 
 
 def test_motion_blur_is_as_long_as_the_turn_while_the_shutter_is_open():
-    """The camera turns at 0.4 rad/s for 50 ms.
-
-    With a focal length of 400 pixels, the blur is 8 pixels long.
-    """
+    """At 0.4 rad/s for 50 ms and a focal length of 400 pixels, the blur is 8 pixels long."""
     point = np.zeros((160, 320), np.uint8)
     point[80, 160] = 255
     images = seen("motion:50", (point, point))
@@ -325,10 +319,7 @@ def test_stereo_gain_takes_stops_of_the_right_side_alone():
 
 @pytest.mark.parametrize(("law", "axis"), [("yaw", 1), ("pitch", 0)])
 def test_a_turned_camera_moves_the_image_by_arc_minutes(law, axis):
-    """With a focal length of 400 pixels, 30 arc minutes are 3.49 pixels.
-
-    The image moves to the left or downwards.
-    """
+    """With a focal length of 400 pixels, 30 arc minutes are 3.49 pixels."""
     image = np.zeros((160, 320), np.uint8)
     image[76:85, 156:165] = 255
     ours, theirs = seen(f"{law}:30", (image, image))

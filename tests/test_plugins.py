@@ -1,7 +1,4 @@
-"""Plug-ins: the package of docs/howto/plugins.md is installed and used.
-
-Broken packages are rejected.
-"""
+"""The package of docs/howto/plugins.md is installed and used. Broken packages are rejected."""
 
 from __future__ import annotations
 

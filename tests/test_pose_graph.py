@@ -148,10 +148,7 @@ def test_same_bytes_every_time():
 
 
 def make_map(views: list[range], T_cw: np.ndarray) -> Map:
-    """Make a map in which keyframe k observes the landmarks ``views[k]``.
-
-    Each keyframe is the parent of the next one.
-    """
+    """Make a chain of keyframes in which keyframe k observes the landmarks ``views[k]``."""
     map_ = Map(1.2 ** np.arange(8))
     n = max(view.stop for view in views)
     for k, view in enumerate(views):
@@ -181,7 +178,6 @@ def line_map(n: int = 8, shift: int = 60) -> Map:
 
 
 def named(graph: PoseGraph) -> dict[tuple[int, int], int]:
-    """Return the kind of each edge by the ids of its keyframes."""
     pairs = map(tuple, graph.keyframes[graph.edges].tolist())
     return dict(zip(pairs, graph.kind.tolist(), strict=True))
 
@@ -239,10 +235,7 @@ def test_culled_keyframes_are_left_out_and_their_loops_kept():
 
 
 def test_the_loop_edge_wins_over_the_edge_of_the_same_keyframes():
-    """A drifted covisibility edge between the same keyframes is replaced.
-
-    When the covisibility edge was kept instead, the ATE rose from 0.96 to 5.2 m (design.md, 13).
-    """
+    """When the drifted covisibility edge was kept instead, the ATE rose from 0.96 to 5.2 m."""
     map_ = line_map()
     T_covisible, T_tree = translation(0, 0, 1.5), translation(0, 0, 0.75)
     for loops in (
@@ -261,10 +254,7 @@ def test_the_loop_edge_wins_over_the_edge_of_the_same_keyframes():
 
 
 def test_a_drifted_covisibility_edge_would_hold_the_drift():
-    """This is why duplicate edges are removed.
-
-    The same loop is closed with and without the drifted edge.
-    """
+    """The same loop is closed with and without the drifted edge."""
     T_wc, loops, true = simulate(3)
     graph = chain_graph(T_wc, loops, true, reach=3)
     alone = check_pose_graph(graph, optimise(graph, CONFIG), CONFIG)
@@ -281,7 +271,7 @@ def test_a_drifted_covisibility_edge_would_hold_the_drift():
 
 
 def test_edges_that_fusing_would_add_are_not_in_the_graph_before_it():
-    """An edge between the two sides of the loop would contain the drift as if it were measured."""
+    """Such an edge across the loop would contain the drift as if it were measured."""
     map_ = line_map()
     loop = closed(7, 0, np.eye(4))
     before = named(essential_graph(map_, [loop], CONFIG))
@@ -353,7 +343,6 @@ SIDES = (70.0, 40.0)
 
 
 def route(n: int, step: float = 1.2) -> np.ndarray:
-    """Return ``(n, 4, 4)`` T_wc of several laps around a rectangle of 220 m."""
     long, short = SIDES
     along = np.arange(n) * step % (2 * (long + short))
     corners = np.array([0.0, long, long + short, 2 * long + short])
@@ -464,10 +453,7 @@ def test_a_loop_off_by_ten_metres_after_two_hundred_is_refused():
 
 @pytest.mark.parametrize(("metres", "yaw"), [(5.0, 0.3), (60.0, 1.6), (200.0, 3.0)])
 def test_a_part_that_began_anew_is_joined_from_wherever_it_was(metres, yaw):
-    """A loop across a weak edge moves the part after the restart as a whole.
-
-    It does not deform this part.
-    """
+    """A loop across a weak edge moves the part after the restart without deforming it."""
     T_wc, loops, measured = simulate(1, n=260, drift=0.5)
     jump = T_wc[119] @ turn(yaw) @ translation(0.6 * metres, 0, 0.8 * metres) @ inverse(T_wc[119])
     lost = T_wc.copy()

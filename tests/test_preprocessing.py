@@ -24,10 +24,7 @@ def walls(direction: np.ndarray, height: np.ndarray) -> np.ndarray:
 
 
 def flat_image(heading: float) -> torch.Tensor:
-    """Return the image of a pinhole camera that looks at the walls.
-
-    The camera has turned by ``heading`` radians.
-    """
+    """Return the image of a pinhole camera that has turned by ``heading`` radians."""
     y, x = (((np.arange(n) + 0.5) / n * 2 - 1) for n in SIZE)
     direction = np.arctan(x * math.tan(math.radians(HALF_ANGLE)))
     image = walls(direction + heading, y[:, None] * np.cos(direction))

@@ -115,7 +115,7 @@ def test_an_error_of_the_camera_comes_after_its_frames():
 
 
 def test_a_live_camera_sets_the_pace_and_dropped_frames_are_let_go():
-    """The time stamps of a live camera do not matter.
+    """The timestamps of a live camera do not matter.
 
     Only frames that wait or are being processed are kept in memory.
     """
@@ -140,10 +140,7 @@ def test_a_live_camera_sets_the_pace_and_dropped_frames_are_let_go():
 
 
 def test_frames_that_were_dropped_are_not_lost(corridor, check_map):
-    """Four of seven frames are dropped.
-
-    Tracking continues, and the poses of the dropped frames lie on the path.
-    """
+    """Four of seven frames are dropped. Their poses lie on the path."""
     slam = Slam(corridor.camera, Config(orb=OrbConfig(n_features=800)), "none", threads=1)
     states = []
     for k in range(len(corridor.left)):
@@ -171,10 +168,7 @@ def test_one_camera_in_real_time(kitti_tree, threads):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
-    """The unreadable image belongs to the last frame, which is never dropped.
-
-    The run still ends normally.
-    """
+    """It belongs to the last frame, which is never dropped. The run still ends normally."""
     root = tmp_path / "kitti"
     shutil.copytree(kitti_tree, root)
     image = root / "sequences" / "00" / "image_0" / "000005.png"

@@ -325,10 +325,7 @@ time.sleep(60)
 
 @pytest.fixture
 def window(monkeypatch):
-    """A process in place of the viewer's window.
-
-    It receives the data that are sent to the window.
-    """
+    """A process in place of the viewer's window, which receives the data that are sent to it."""
     started = []
 
     def start(port, words):

@@ -196,10 +196,7 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
 
 
 def report_of(outcome: RunOutcome, folder: Path) -> ReportJson:
-    """Write the report as the command line does.
-
-    Check that the file on the disk equals the result.
-    """
+    """Write the report as the command line does, and check that the file equals the result."""
     report = write_results(folder, outcome)
     assert ReportJson.model_validate_json((folder / "report.json").read_bytes()) == report
     return report
@@ -599,10 +596,7 @@ def test_a_right_loop_on_a_revisit_too_short_to_count_is_explained() -> None:
 
 
 def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:
-    """The estimate has its own world frame and is aligned.
-
-    The keyframes before the correction are aligned in the same way.
-    """
+    """The keyframes before the correction are aligned in the same way as the estimate."""
     outcome = two_laps()
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]

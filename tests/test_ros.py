@@ -176,10 +176,7 @@ def track(T: np.ndarray, local: np.ndarray | None) -> TrackResult:
 
 
 def test_the_axes_are_those_of_rep_103():
-    """The camera drives ahead, turns right and drives ahead again.
-
-    First x increases, then y decreases.
-    """
+    """The camera moves ahead, turns right and moves ahead. First x increases, then y decreases."""
     types = types_of_ros()
     before, now = AHEAD, AHEAD @ RIGHT_TURN @ AHEAD
     poses = [FramePose.of(track(T, None), t) for T, t in ((before, 10**9), (now, 3 * 10**9))]
@@ -289,10 +286,7 @@ def test_files_of_a_run_that_were_lost_or_changed(folder, tmp_path, name, text, 
 
 
 def infos(baseline: float = 0.5, **changed: object) -> list[SimpleNamespace]:
-    """Return the ``camera_info`` of a rectified pair.
-
-    ``changed`` are fields of the right camera.
-    """
+    """Return the ``camera_info`` of a rectified pair, with ``changed`` fields on the right."""
     pair = []
     for side in (0, 1):
         P = [700.0, 0, 310, -side * 700 * baseline, 0, 710, 120, 0, 0, 0, 1, 0]

@@ -57,7 +57,7 @@ def features(n: int) -> Features:
 
 
 def a_map(keyframes: int, covisible: tuple[tuple[int, int], ...] = ()) -> Map:
-    """Make a map of keyframes with 20 features each. The keyframes of a pair share 16 landmarks."""
+    """Make a map of keyframes with 20 features. The keyframes of a pair share 16 landmarks."""
     map_ = Map(np.ones(8))
     for k in range(keyframes):
         map_.add_keyframe(features(100), np.eye(4), float(k), k)
@@ -89,7 +89,7 @@ def exported() -> OnnxNetwork:
 
 
 def detector(config: SiameseConfig | None = None, places: list[int] | None = None):
-    """Make a detector that was given one image for each keyframe, by the number of the scene."""
+    """Make a detector with one image for each keyframe, from the scenes in ``places``."""
     config = config or SiameseConfig(recent_keyframes=3, threshold=0.0)
     found = SiameseDetector(exported(), config)
     for keyframe, place in enumerate(places or []):
@@ -296,10 +296,7 @@ def test_the_network_sees_nothing_until_the_camera_may_be_back():
 
 @pytest.mark.slow
 def test_a_run_takes_the_weights_of_a_file(kitti_tree, tmp_path):
-    """With random weights, many wrong places are similar.
-
-    Geometric verification must reject them.
-    """
+    """With random weights, many wrong places are similar. Geometric verification rejects them."""
     path = tmp_path / "capsule.onnx"
     export_onnx(small_network(), path)
     settings = tmp_path / "config.json"

@@ -203,10 +203,7 @@ TWIST = np.array([0.3, 0.0, -8.0, 0.0, -0.3, 0.0])  # per second: ahead and to t
 
 
 def driven(delay_s: float = 0.0, turned_px: float = 0.0, n: int = 5000) -> SimpleNamespace:
-    """Make a map of 10 keyframes with exact observations.
-
-    Only those of the right image have errors.
-    """
+    """Make a map of 10 keyframes with exact left observations and wrong right observations."""
     rng = np.random.default_rng(1)
     times = 0.1 * np.arange(10)
     T_cw = np.array([se3_exp(TWIST * t) for t in times])

@@ -41,7 +41,6 @@ def scene(seed: int, n: int, outliers: float, scale: float = 1.0, noise: float =
 
 
 def errors(T: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Return the differences in metres and in degrees."""
     twist = se3_log(T @ inverse(truth))
     return float(np.linalg.norm(twist[:3])), float(np.degrees(np.linalg.norm(twist[3:])))
 

@@ -112,10 +112,9 @@ def test_a_lap_whose_scale_drifted_closes():
 
 
 def test_where_tracking_was_lost_the_error_of_a_lap_spreads_if_the_camera_drove_on():
-    """Tracking is lost half-way.
+    """Tracking is lost half-way, and the unit changes by a third.
 
-    The unit changes by a third, and the predicted motion in the gap is too short and has a wrong
-    direction.
+    The predicted motion in the gap is too short and has a wrong direction.
     """
     growth, after = 1.004, 60
     truth, estimate = drifted_lap(growth)

@@ -53,7 +53,6 @@ def report_of(cell: Cell, **figures: object) -> ReportJson:
 
 
 def searched(fails, steps: int = 5) -> tuple[list[float], dict[float, str]]:
-    """Run a bisection against ``fails(position)``."""
     verdicts: dict[float, str] = {}
     order = []
     while (position := next_position({p: bool(v) for p, v in verdicts.items()}, steps)) is not None:

@@ -63,10 +63,7 @@ def town(route):
 
 
 def dotted_world():
-    """Make a slanted wall with bright dots before grey ground.
-
-    Also return the dots in world coordinates.
-    """
+    """Make a slanted wall with bright dots before grey ground, and the positions of the dots."""
     y, x = np.mgrid[0:SIDE, 0:SIDE] + 0.5
     pitch = SIDE / DOTS
     from_dot = ((x % pitch) - pitch / 2) ** 2 + ((y % pitch) - pitch / 2) ** 2
@@ -102,7 +99,6 @@ def draw(surfaces, atlas, sky, T_wc, threads=1):
 
 
 def centroids(image, near):
-    """Return the centroids of bright dots close to the places ``near``."""
     found = []
     for u, v in near:
         c, r = round(u), round(v)
@@ -196,10 +192,7 @@ def test_shadow_falls_away_from_the_sun():
 
 @pytest.fixture
 def unpainted(monkeypatch):
-    """Make towns with the real geometry, but with textures that need no time.
-
-    Their ground is far below.
-    """
+    """Make towns with the real geometry, but with textures that need no time and deep ground."""
     plain = np.full((2, 2), 99.0, np.float32)
     twice = (plain, plain)
     for module, names, value in (
@@ -507,7 +500,6 @@ def test_lamps_cast_pools():
 
 
 def rounds(n, radius=32.0, laps=1.6):
-    """Return the poses of a drive around a circle."""
     angle = np.linspace(0, 2 * np.pi * laps, n)
     T = np.stack([turn(a) for a in angle])
     T = np.concatenate([T, np.zeros((n, 3, 1))], axis=2)

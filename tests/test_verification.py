@@ -1,4 +1,4 @@
-"""Loop candidates on a simulated street that is driven twice, with drift between the two passes."""
+"""Loop candidates on a simulated street that is passed twice, with drift between the passes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ DRIFT = se3_exp(np.array([3.0, -0.4, 5.0, 0.02, 0.15, -0.01]))
 
 
 def forward(metres: float, sideways: float = 0.0, yaw: float = 0.0) -> np.ndarray:
-    """Return ``T_cw`` of a camera on the street."""
     return inverse(se3_exp(np.array([sideways, 0.0, metres, 0.0, yaw, 0.0])))
 
 
@@ -51,10 +50,9 @@ def let_drift(world: World, keyframes: range) -> None:
 
 
 def street(among=None, *, mono: bool = False, seed: int = 0, noise: float = 0.5) -> World:
-    """Make a map of a street that was driven twice.
+    """Make a map of a street that was passed twice.
 
-    In the second pass, only the points in ``among`` have the same descriptors. The other points
-    exist, but have new descriptors.
+    In the second pass, the points that are not in ``among`` have new descriptors.
     """
     world = make_world(900, seed=seed)
     for i in range(PASS):
@@ -77,7 +75,6 @@ def check(world: World, config: VerificationConfig = CONFIG, query: int = 6, mat
 
 
 def error(world: World, edge) -> tuple[float, float]:
-    """Return the error of the pose of an edge in metres and in degrees."""
     true = world.truth[edge.query] @ inverse(world.truth[edge.match])
     twist = se3_log(edge.T_query_match @ inverse(true))
     return float(np.linalg.norm(twist[:3])), float(np.degrees(np.linalg.norm(twist[3:])))

@@ -1,4 +1,4 @@
-"""The verifiers of loop closing: ORB, learned descriptors, and these where ORB fails."""
+"""The verifiers of loop closing: ORB descriptors, and learned descriptors where ORB fails."""
 
 from __future__ import annotations
 

@@ -42,7 +42,6 @@ def wide_images(n: int, seed: int = 0, width: int = 81) -> torch.Tensor:
 
 
 def wide_views(places: int) -> object:
-    """Make the images of ``views`` with a size of 48x81."""
     collection = views(places)
     resize = [cv2.resize(image, (81, 48)) for image in collection.images]
     return replace(collection, images=np.stack(resize))
@@ -200,10 +199,7 @@ def test_one_against_many_is_pair_by_pair():
 
 
 def lite_network() -> SiameseNetwork:
-    """Make a network with three views.
-
-    Each has 49 of the 81 columns, and they are 16 columns apart.
-    """
+    """Make a network with three views of 49 of the 81 columns, which are 16 columns apart."""
     shape = CapsuleShape(
         extractor="lite0", pixels=48, width=81, views=3, view_width=49, types=4, outputs=4
     )

@@ -33,7 +33,6 @@ def bits(descriptors: np.ndarray) -> np.ndarray:
 
 
 def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return ``(M, N)`` Hamming distances."""
     return (bits(a)[:, None] != bits(b)[None]).sum(axis=2)
 
 
@@ -42,10 +41,7 @@ def random_descriptors(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def noisy(rng: np.random.Generator, centres: np.ndarray, n: int, flips: int) -> np.ndarray:
-    """Return ``n`` copies of each centre, with ``flips`` bits flipped in each copy.
-
-    The copies of a centre follow each other.
-    """
+    """Return ``n`` successive copies of each centre, with ``flips`` bits flipped in each copy."""
     copies = np.repeat(bits(centres), n, axis=0)
     for row in copies:
         row[rng.choice(256, flips, replace=False)] ^= 1

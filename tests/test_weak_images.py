@@ -70,10 +70,7 @@ def test_usual_images_stay_the_same_objects():
 
 
 def test_a_textureless_image_of_good_light_is_not_touched():
-    """An image with few corners does not always have low contrast.
-
-    The contrast in blocks of the image decides.
-    """
+    """Few corners do not mean low contrast. The contrast in blocks of the image decides."""
     stripes = np.tile(np.where(np.arange(400) // 12 % 2, 180, 60).astype(np.uint8), (200, 1))
     (found,) = extract_in_any_light([stripes], CONFIG)
     assert len(found.xy) < 0.5 * ORB.n_features

@@ -15,7 +15,7 @@ PATIENCE = 20.0  # seconds, for what takes milliseconds on an idle machine
 
 
 def occupy(workers: Workers) -> tuple[Job[bool], threading.Event]:
-    """Let the only worker wait in a job. Returns the job, and the event that ends it."""
+    """Let the only worker wait in a job. Return the job, and the event that ends it."""
     begun, end = threading.Event(), threading.Event()
 
     def work() -> bool:

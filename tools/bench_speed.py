@@ -482,7 +482,7 @@ def anonymous(command: str) -> str:
 
 
 def written(page: Path) -> tuple[str, str]:
-    """Return the hand-written parts of a page: before ``BEGIN``, and from ``END`` on."""
+    """Return the hand-written parts of a page: before ``BEGIN``, and after ``END``."""
     text = page.read_text(encoding="utf-8") if page.exists() else ""
     above, begin, rest = text.partition(BEGIN)
     _, end, below = rest.partition(END)

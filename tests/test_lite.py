@@ -157,7 +157,7 @@ def test_fine_tuning_leaves_the_first_blocks_and_moves_the_rest_slowly(tmp_path,
     extractor = {key for key in moved if key.startswith("branch.extractor.")} - frozen
     others = {key for key in moved if key.startswith(("branch.primary", "branch.capsules"))}
     assert {moved[key] for key in frozen} == {0.0}
-    # Adam's first steps are as large as the learning rate, whatever the gradient.
+    # The first steps of Adam are as large as the learning rate, independent of the gradient.
     assert 0.0 < max(moved[key] for key in extractor) <= 2.1 * 1e-5
     assert max(moved[key] for key in others) > 1e-4
 

@@ -100,5 +100,5 @@ def test_a_point_must_lead_back():
     place = np.array([[308.0, 90.0], [324.0, 90.0]], np.float32)
     expected = np.array([[308.0, 90.0], [308.0, 90.0]])
     assert locate_near(place, expected, a, b, 2, 0.3).found.tolist() == [True, True]
-    # Once the window holds both, only the true one is the nearest of what was found.
+    # If the window contains both places, only the true one is matched in both directions.
     assert locate_near(place, expected, a, b, 5, 0.3).found.tolist() == [True, False]

@@ -65,7 +65,7 @@ while entered < 100:
             time.sleep(0.0002)
             (folder / "inside").unlink()
             entered += 1
-        (folder / ".lock").write_text("999999999")  # as a killed process once left it
+        (folder / ".lock").write_text("999999999")  # left by a killed process
     except InputError:
         pass
 """

@@ -80,7 +80,7 @@ def test_an_appended_map_is_as_it_was(drives, check_map):
     assert np.array_equal(words.of(n + k), other.detector.tables["words"].of(k))
     assert both.map.sessions.tolist() == [0] * n + [1] * other.map.n_keyframes
     assert both.drives == ("ring 0", "ring 110")
-    # Each is in a part of its own until a loop joins them.
+    # Each drive is a separate part until a loop joins them.
     assert np.unique(both.map.submaps()).tolist() == [0, n]
 
 
@@ -107,7 +107,7 @@ def test_drives_that_meet_become_one_map(drives, ring, check_map, tmp_path):
     assert any({0, 1} <= seen | {sessions[k]} for k, seen in enumerate(shared))
     assert any({1, 2} <= seen | {sessions[k]} for k, seen in enumerate(shared))
 
-    # It is a map like any other: a camera is found in the parts of all three, or goes on in it.
+    # In the merged map, a camera can be relocalised in all three parts.
     save_map(tmp_path / "town.npz", merged.stored)
     for place in (10, 90, 170):
         slam = Slam.load(tmp_path / "town.npz", threads=1, localize=True)
@@ -229,7 +229,7 @@ def test_a_merged_map_is_exported(drives, tmp_path):
     ids = [line.split()[1] for line in lines if line.startswith("VERTEX")]
     assert ids == [str(k) for k in range(merged.map.n_keyframes)]
     assert (tmp_path / "town.ply").stat().st_size > 0
-    # The edges are weighted by the thresholds that the map was made with.
+    # The edges are weighted by the thresholds with which the map was made.
     drifting = replace(merged, thresholds={"pose_graph.rotation_drift": 0.1})
     save_map(tmp_path / "drifting.npz", drifting)
     result = run("export", "g2o", tmp_path / "drifting.npz")

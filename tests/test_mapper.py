@@ -30,12 +30,12 @@ from vslam.workers import Workers
 
 POINTS = Points.create()
 RING = ring.Ring.create(zoom=True)
-# A job runs as late as can be, where its result is needed, or as early as can be, at once.
+# A job runs either as late as possible (when its result is needed) or at once.
 late_and_early = pytest.mark.parametrize(
     "workers", [lambda: Workers(1), InstantWorkers], ids=["late", "early"]
 )
 
-AT_THE_END = -1  # in place of a keyframe
+AT_THE_END = -1  # instead of the number of a keyframe
 
 
 class Closing:
@@ -178,7 +178,7 @@ def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(workers, aft
     assert mapper.view is not shown
     assert len(mapper.view.local_landmarks.ids) > len(
         shown.local_landmarks.ids
-    )  # two keyframes triangulate
+    )  # with two keyframes, landmarks are triangulated
     merged = mapper.view
     drive.step()
     assert mapper.view is merged
@@ -208,7 +208,7 @@ def test_a_keyframe_merges_the_one_before():
     assert processed == [0]
     drive.step(keyframe=True)
     assert processed == [0, 1]
-    assert not drive.mapper.is_merged  # the new one is not, though
+    assert not drive.mapper.is_merged  # the new keyframe is not merged
 
 
 def trace_on_the_ring(workers, look: Callable[[Mapper], object] = lambda mapper: None) -> list:
@@ -232,7 +232,7 @@ def trace_on_the_ring(workers, look: Callable[[Mapper], object] = lambda mapper:
         seen.append((counts, bytes_of_view(mapper.view), np.array(poses).tobytes()))
         look(mapper)
     drive.mapper.finish()
-    assert len({view for _, view, _ in seen}) == 10  # each keyframe and each merge changes it
+    assert len({view for _, view, _ in seen}) == 10  # each keyframe and each merge changes the view
     trajectory = drive.mapper.trajectory().T_wc.tobytes()
     return [*seen, bytes_of_map(drive.mapper.map), trajectory]
 
@@ -258,7 +258,7 @@ def test_completing_shows_tracking_nothing(workers):
     assert (mapper.is_merged, mapper.is_mapping) == (False, False)
     assert mapper.view is shown
     assert [(frame.T_cw.tobytes(), frame.landmark.tobytes()) for frame in held] == before
-    assert mapper.complete() is map_  # and again
+    assert mapper.complete() is map_  # the second call returns the same map
     mapper.merge()
     assert mapper.view is not shown
 
@@ -270,7 +270,7 @@ def test_the_map_is_not_to_be_had_while_a_keyframe_is_mapped(workers):
     for use in (lambda: drive.mapper.map, drive.mapper.trajectory):
         with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
             use()
-    # Frames are placed by the reference keyframe, which is known; others may be moving.
+    # Frames are placed by the reference keyframe. Other keyframes may be moving.
     np.testing.assert_array_equal(drive.mapper.keyframe_pose(1), drive.mapper.view.T_reference)
     with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
         drive.mapper.keyframe_pose(0)
@@ -435,7 +435,7 @@ def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_
         np.testing.assert_allclose(frame.T_cw[:3, 3], 2.0 * before[:3, 3], atol=2e-3)
         np.testing.assert_allclose(frame.T_cw[:3, :3], before[:3, :3], atol=1e-4)
     drive.mapper.hold(*held)
-    drive.mapper.finish()  # nothing more has changed
+    drive.mapper.finish()  # finish has changed nothing
     np.testing.assert_allclose(held[0].twist, [2, 4, 6, 4, 5, 6])
 
 
@@ -493,7 +493,7 @@ def test_the_reference_can_be_the_keyframe_that_shares_the_most_with_a_frame():
     other = np.isin(frame.landmark, mapper.map.landmarks_of(1))
     frame.landmark[other], frame.xyz[other] = -1, np.nan
     mapper.refer_to_nearest(frame)
-    assert mapper.reference == 1  # the frame shares none with any
+    assert mapper.reference == 1  # the frame shares no landmark with any keyframe
     frame.landmark[:] = -1
     frame.landmark[:20] = np.setdiff1d(mapper.map.landmarks_of(0), mapper.map.landmarks_of(1))[:20]
     mapper.refer_to_nearest(frame)
@@ -531,7 +531,7 @@ def test_an_old_keyframe_can_serve_in_place_of_a_new_one(is_due):
     assert (mapper.is_mapping, mapper.is_merged) == (is_due, not is_due)
     drive.step()
     assert drive.closing.finished == 0
-    drive.step()  # two frames after
+    drive.step()  # two frames later
     assert drive.closing.finished == is_due
     assert mapper.is_merged
 
@@ -540,12 +540,12 @@ def test_far_points_are_mapped_of_the_first_keyframe_while_it_is_the_only_one():
     drive = Drive()
     frame = drive.step(keyframe=True)
     near, n = drive.mapper.view, np.count_nonzero(frame.landmark >= 0)
-    assert not drive.mapper.map_far_points(drive.next_frame())  # another frame
+    assert not drive.mapper.map_far_points(drive.next_frame())  # not the frame of the keyframe
     assert drive.mapper.map_far_points(frame)
     assert n < np.count_nonzero(frame.landmark >= 0) == 240
     assert len(drive.mapper.view.local_landmarks.ids) == 240 > len(near.local_landmarks.ids)
     assert np.isfinite(frame.xyz).all()
-    assert not drive.mapper.map_far_points(frame)  # there are no more
+    assert not drive.mapper.map_far_points(frame)  # there are no more far points
     drive = Drive()
     first = drive.step(keyframe=True)
     second = drive.step(keyframe=True)

@@ -310,7 +310,7 @@ def test_a_row_for_each_sequence_and_condition_and_who_wins_over_all(two_conditi
     lost, found, ate, rpe = points.sentences
     assert lost == "Lost frames: bow 6 in 18 runs, both 6 in 18 runs."
     assert found.endswith(": bow found 6 of 18, 0 wrong; both found 18 of 18, 0 wrong.")
-    # Half of what brightness costs: the other condition is a tie.
+    # Half of the difference under brightness, because the other condition is a tie.
     assert ate.startswith(
         "ATE over all conditions, both against bow: both wins. Of 6 sequences, bo"
     )
@@ -327,7 +327,7 @@ def test_the_table_of_a_short_name_fits_a_terminal_of_80_columns(two_conditions,
     assert lines[2].split() == [
         "sequence", "perturbation", *["bow", "both"] * 5,
     ]  # fmt: skip
-    for head in lines[:3]:  # numbers and their headings end in one column
+    for head in lines[:3]:  # numbers are aligned with their headings
         ends = {match.end() for match in re.finditer(r"\S+", lines[4])}
         assert {match.end() for match in re.finditer(r"\S+", head[22:])} <= {e - 22 for e in ends}
     assert "- RPE over all conditions, both against bow: a tie on all 6 sequences." in printed
@@ -398,7 +398,7 @@ def test_what_a_run_does_not_have_is_not_made_up():
     )  # fmt: skip
     assert table.rows[1][2:5] == ("n/a", "n/a", "1.000")
     assert points.sentences[0] == "Lost frames: bow 0 in 1 run, both n/a in 1 run."
-    assert len(points.sentences) == 2  # nothing to compare
+    assert len(points.sentences) == 2  # there is no comparison
 
 
 @pytest.mark.parametrize(("ate", "part"), [(1.0, "cannot differ"), (1.5, "on shorter stretches")])

@@ -191,7 +191,7 @@ def test_the_image_is_not_root_and_copies_what_exists():
     known = {o for p in get_command(app).commands["run"].params for o in p.opts}  # type: ignore[attr-defined]
     assert {word for word in command.split() if word.startswith("--")} <= known
     (compiling,) = (rest for word, rest in steps if word == "RUN" and "compile_kernels" in rest)
-    assert "chmod -R a+rwX /cache/*" in compiling  # any --user has to write there
+    assert "chmod -R a+rwX /cache/*" in compiling  # any --user must be able to write there
     for name in re.findall(r"from (vslam\.\S+) import (\w+)", "\n".join(lines)):
         source = ROOT / (name[0].replace(".", "/") + ".py")
         assert f"def {name[1]}(" in source.read_text()

@@ -101,7 +101,7 @@ RULES = {
     ),
     "docs/howto/bench.md": Rules(
         (
-            # All frames: straight ahead alone no error is defined.
+            # All frames are needed, because errors are not defined for a straight path.
             ("vslam bench --out bench/kitti", "vslam bench --seqs 00 --seeds 1 --out bench/kitti"),
             ("synthetic --out", f"synthetic --seqs block --max-frames {N} --perturb none --out"),
             (

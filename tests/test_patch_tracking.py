@@ -122,7 +122,8 @@ def test_image_alignment_that_follows_a_moving_object_is_not_believed(corridor, 
 
     def track(pyramid, T_cw, *rest):
         found = track_patches(pyramid, T_cw, *rest)
-        follows = any(T_cw is T for T in misled_poses)  # a third of the patches do not
+        # A third of the patches do not follow the object.
+        follows = any(T_cw is T for T in misled_poses)
         return found._replace(n_matches=len(found.ids) * 3 // 2) if follows else found
 
     slam, results = driven(corridor)

@@ -66,7 +66,7 @@ def seen(spec: str, images: tuple, index: int = 3, seed: int = 0, drive: Source 
 
 
 def test_at_the_visibility_contrast_is_five_percent():
-    left, right = wall(20.0)  # seen along the axis, in the middle of the image
+    left, right = wall(20.0)  # on the optical axis
     foggy = seen("fog:20", (left, right))
     at = np.s_[60:100, 140:180]
     for clear, hazy in zip((left, right), foggy, strict=True):
@@ -81,7 +81,7 @@ def test_at_the_visibility_contrast_is_five_percent():
 
 def test_fog_takes_the_depth_image_where_there_is_one():
     depth = np.full((160, 320), 12.0, np.float32)
-    depth[:, :100] = 0.0  # unknown: far
+    depth[:, :100] = 0.0  # unknown depth counts as far
     camera = Camera(400.0, 400.0, 160.0, 80.0, 0.5, 320, 160, depth=True)
     left, _ = wall(20.0)
     foggy, same = seen("fog:12", (left, depth), drive=drive_of(camera))
@@ -141,7 +141,7 @@ def test_dark_lowers_gain_and_gamma_in_turn():
     levels = np.array([seen(f"dark:{level}", (ramp, None))[0][0] for level in range(13)], float)
     np.testing.assert_array_equal(levels[0], ramp[0])
     np.testing.assert_array_equal(levels[3], np.rint(255 * 0.7 * (ramp[0] / 255) ** (1 / 0.9)))
-    white = levels[:, 255]  # gamma leaves it as it is
+    white = levels[:, 255]  # gamma does not change white
     assert (np.diff(white)[::2] < -30).all()
     assert (np.diff(white)[1::2] == 0).all()
     assert (np.diff(levels[:, 128]) < 0).all()

@@ -188,7 +188,8 @@ def test_vslam_selects_frames_of_a_reader(installed, corridor, tmp_path: Path):
     assert second is None
     with pytest.raises(InputError, match=r"--calib: the reader frames .* leave the option out"):
         open_sequence("frames", data, calib=[Path("a.yaml")])
-    with pytest.raises(InputError, match=r"elsewhere\.npz: no such file"):  # its own words
+    # The plug-in's own message.
+    with pytest.raises(InputError, match=r"elsewhere\.npz: no such file"):
         open_sequence("frames", data, "elsewhere")
 
 

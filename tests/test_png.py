@@ -49,7 +49,7 @@ def filtered(image, filters):
     a, b, c = padded[1:, :-1], padded[:-1, 1:], padded[:-1, :-1]
     p = a + b - c
     errors = np.stack([abs(p - a), abs(p - b), abs(p - c)])
-    paeth = np.choose(np.argmin(errors, axis=0), [a, b, c])  # of equal ones the first
+    paeth = np.choose(np.argmin(errors, axis=0), [a, b, c])  # the first one if several are equal
     predictions = np.stack([np.zeros_like(a), a, b, (a + b) // 2, paeth])
     lines = (image - predictions[filters, np.arange(len(image))]) % 256
     return np.column_stack([filters, lines]).astype(np.uint8).tobytes()

@@ -111,7 +111,7 @@ def test_finds_gtsams_optimum_of_the_inliers(kind):
     assert np.count_nonzero(inlier) > 50
     expected = gtsam_pose(points[inlier], uvr[inlier], weight[inlier])
     assert pose_difference(T, expected) < 1e-6
-    assert pose_difference(T, TRUTH) > 1e-4  # noise: both are as far from the truth
+    assert pose_difference(T, TRUTH) > 1e-4  # because of the noise, both differ from the truth
 
 
 def test_octaves_weigh_the_observations():

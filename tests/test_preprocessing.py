@@ -40,7 +40,7 @@ def test_unrolled_images_show_the_cylinder_whatever_the_heading(heading, middle)
     beyond = np.abs(middle * y[:, None] / np.cos(direction)) > 1 + 1 / SIZE[0]
     expected = walls(direction + heading, middle * np.repeat(y[:, None], SIZE[1], 1))
     within = np.abs(middle * y[:, None] / np.cos(direction)) < 1 - 1 / SIZE[0]
-    # The outermost pixels are half black.
+    # The outermost pixels are partly black.
     assert np.abs(seen - expected)[within].max() < 0.01
     assert np.all(seen[beyond] == 0)
     assert np.all(seen > 0) == (middle < 0.9)

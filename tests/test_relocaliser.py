@@ -152,7 +152,8 @@ def test_where_orb_finds_nothing_the_frame_may_be_recognised_in_another_way(matc
     place = Place.create(matches, recognise)
     before = map_bytes(place.world)
     frame, localised = place.frame, recognise.localised
-    frame.shift = np.zeros((len(frame.features), 2), np.float32)  # of matches that are no more
+    # Shifts of matches that are removed.
+    frame.shift = np.zeros((len(frame.features), 2), np.float32)
     found = place.find()
     assert (found.state, found.n_inliers, found.keyframe) == (TrackingState.OK, 30, 2)
     assert len(recognise.asked) == 1

@@ -37,7 +37,7 @@ from vslam.report.folder import write_results
 from vslam.trajectory import read_trajectory
 
 ROOT = Path(__file__).parents[1]
-TRANSIENT_LOCAL = 1  # of rmw's enum rmw_qos_durability_policy_t
+TRANSIENT_LOCAL = 1  # value in rmw's enum rmw_qos_durability_policy_t
 AHEAD = se3_exp(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
 RIGHT_TURN = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.0]))
 
@@ -114,7 +114,7 @@ def test_a_bag_says_what_the_files_of_the_run_say(folder, tmp_path, online):
     ((_, static),) = bag["/tf_static"]
     (fixed,) = static.transforms
     assert (fixed.header.frame_id, fixed.child_frame_id) == ("base_link", "camera_optical")
-    # From the camera along the tree of frames: its pose in the map, with the axes of ROS.
+    # The pose of the camera in the map, computed along the tree of frames.
     for k, (time, tf) in enumerate(bag["/tf"]):
         names = [(one.header.frame_id, one.child_frame_id) for one in tf.transforms]
         assert names == [("map", "odom"), ("odom", "base_link")]

@@ -90,7 +90,7 @@ def test_speeds_are_the_derivatives_of_projections():
         assert late.row_offset is not None
         moved = (late.row_offset - still.row_offset) / 1e-5
         expected = CAMERA.fy * row_speeds(x, y, inverse_depth)[:, k]
-        assert moved == pytest.approx(expected, abs=2.0)  # pixels a second, of up to 400
+        assert moved == pytest.approx(expected, abs=2.0)  # pixels per second; up to 400 occur
 
 
 @pytest.mark.parametrize("delay", [-8e-3, 3e-3, 12e-3])

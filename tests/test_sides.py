@@ -86,7 +86,7 @@ def test_a_bright_strip_that_one_side_sees_is_no_gain(side):
     pair = [left.copy(), right.copy()]
     for image in pair:
         image[:50] = 255  # the sky
-    pair[side][50:66] = 150  # beyond the edge of the other image
+    pair[side][50:66] = 150  # outside the view of the other image
     assert compare_sides(*pair, CONFIG) == Sides()
     assert balance(*pair)[side] is pair[side]
 
@@ -242,7 +242,7 @@ def test_a_map_that_cannot_tell_says_nothing():
     assert measure_rig(driven(), CAMERA.left_camera()) is None
     still = driven()
     still.timestamps = 100.0 * np.arange(10)
-    assert measure_rig(still, CAMERA) is None  # gaps: nobody knows how it moved
+    assert measure_rig(still, CAMERA) is None  # in gaps, the motion is unknown
     assert residual_warnings(None, CAMERA) == []
 
 

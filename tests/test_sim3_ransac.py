@@ -90,8 +90,8 @@ def test_points_of_weight_zero_do_not_count():
 
 
 def test_seventy_percent_of_outliers():
-    # Of 100 matches 30 are right, and 0.7 px of noise in each camera takes 1 in 10 of them in each
-    # camera: some 25 are left for RANSAC to find.
+    # Of 100 matches, 30 are right. Noise of 0.7 px makes one in ten of them an outlier in each
+    # camera, so that about 25 are left.
     metres, degrees = [], []
     for seed in range(100):
         T, a, b, wrong = scene(seed, 100, 0.7)

@@ -23,7 +23,7 @@ from vslam.slam import Slam
 
 ORB = OrbConfig(n_features=800)
 CONFIG = Config(orb=ORB)
-# A keyframe at every frame keeps mapping and merging busy.
+# With a keyframe at every frame, mapping and merging never pause.
 EAGER = Config(orb=ORB, keyframes=KeyframeConfig(max_interval_s=0.05))
 
 
@@ -130,7 +130,7 @@ def test_a_fork_tracks_with_one_thread_and_is_refused_with_more(corridor, thread
     finally:
         process.kill()
         process.join()
-    go_on(range(6, 12))  # the parent's is as it was
+    go_on(range(6, 12))  # the map of the parent has not changed
 
 
 def test_results_account_for_every_frame(corridor):
@@ -163,7 +163,7 @@ def test_landmarks_lie_on_the_walls_and_the_ground(corridor):
     x, y, z = slam.map.arrays.xyz[slam.map.living_landmarks()].T
     assert len(x) > 500
     distance = np.min([np.abs(y - 1.5), np.abs(x + 4.0), np.abs(x - 4.5), np.abs(z - 32.0)], axis=0)
-    assert np.median(distance) < 0.08  # metres; far points of coarse octaves count as much
+    assert np.median(distance) < 0.08  # metres; far points of coarse octaves are included
     assert np.mean(distance < 0.3) > 0.8
 
 
@@ -218,10 +218,10 @@ def test_the_pose_is_known_before_a_frame_becomes_a_keyframe(corridor):
             corridor.left[:6], corridor.right[:6], corridor.timestamps[:6], strict=True
         )
     ]
-    assert [n for _, n in known] == [1, 1, 2, 3, 4, 5]  # keyframes before that of the frame
+    assert [n for _, n in known] == [1, 1, 2, 3, 4, 5]  # keyframes merged so far
     for (first, _), result in zip(known[1:], results[1:], strict=True):
         assert (first.is_keyframe, result.is_keyframe) == (False, True)
-        # The insertion merges the keyframe before, which may move the frame a little.
+        # The insertion merges the previous keyframe, which may move the frame slightly.
         np.testing.assert_allclose(first.T_wc, result.T_wc, atol=0.02)
 
 
@@ -255,7 +255,7 @@ def test_counters_of_landmarks_stay_in_order(corridor):
     assert np.mean(a.found[living] <= a.visible[living]) > 0.99
 
 
-# -- trouble --------------------------------------------------------------------------------------
+# -- faults ---------------------------------------------------------------------------------------
 
 
 def test_black_frames_are_lost_at_the_predicted_pose_and_tracking_recovers(corridor):
@@ -268,7 +268,7 @@ def test_black_frames_are_lost_at_the_predicted_pose_and_tracking_recovers(corri
             0,
             False,
         )
-    # Constant velocity: 0.35 m a frame along a gentle curve.
+    # The camera moves by 0.35 m per frame along a gentle curve.
     np.testing.assert_allclose(
         [r.T_wc[:3, 3] for r in results[12:15]], corridor.T_wc[12:15, :3, 3], rtol=0, atol=0.15
     )
@@ -288,7 +288,7 @@ def test_a_black_frame_soon_after_a_keyframe_does_not_move_the_frame_before(corr
     for k in range(black):
         slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
     last = slam.frame
-    for k in (black, black + 1):  # two, so that the merge is behind us
+    for k in (black, black + 1):  # two frames, so that the merge is done
         slam.step(nothing, nothing, corridor.timestamps[k])
     assert slam.frame is last
     slam.finish()
@@ -301,8 +301,8 @@ def test_lost_for_long_mapping_restarts_at_the_predicted_pose(corridor, check_ma
     """If the map has only just begun, mapping restarts after one lost frame."""
     tracking = TrackingConfig(lost_frames_before_restart=4, young_keyframes=young)
     config = Config(orb=ORB, tracking=tracking)
-    # From frame 10 on the camera is elsewhere: the images of the corridor run backwards, upside
-    # down, so that nothing can be recognised.
+    # From frame 10, the images of the corridor are in reverse order and upside down, so that
+    # nothing can be recognised.
     frames = list(range(20))
     slam = Slam(corridor.camera, config, "none", threads=1)
     results = []
@@ -316,7 +316,7 @@ def test_lost_for_long_mapping_restarts_at_the_predicted_pose(corridor, check_ma
     assert states(results[10:]) == "L" * lost + "O" * (10 - lost)
     assert [r.is_keyframe for r in results[10 : 10 + lost]] == [False] * (lost - 1) + [True]
     T_wc = slam.trajectory().T_wc
-    # Still 0.35 m a frame, seen from the prediction.
+    # The motion is still 0.35 m per frame, relative to the prediction.
     steps = np.linalg.norm(np.diff(T_wc[9 + lost :, :3, 3], axis=0), axis=1)
     np.testing.assert_allclose(steps, 0.35, rtol=0, atol=0.05)
     check_map(slam.map)

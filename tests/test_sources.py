@@ -284,7 +284,7 @@ def test_a_camera_at_a_url(folder, served):
     assert source.live
     assert source.n_expected is None
     outcome = run_source(source, realtime=True)
-    assert len(outcome.tracks) == FRAMES - 1  # the first image has told the size
+    assert len(outcome.tracks) == FRAMES - 1  # the first image was used to find the image size
     assert "stopped after 11 images" in outcome.interrupted
     assert np.all(np.diff(outcome.trajectory.timestamps) > 0)
     assert abs(outcome.trajectory.timestamps[0] - time.monotonic()) < 60.0

@@ -60,6 +60,6 @@ def test_a_frame_tracked_and_mapped(corridor):
             slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
         slam.finish()
 
-    cv2.setNumThreads(1)  # what other threads do is not counted
+    cv2.setNumThreads(1)  # the time of other threads would not be counted
     fixed, driven = least_in_turn(lambda: fixed_work(image, out), drive)
     assert driven / fixed / len(corridor.left) < 10 * RATIO_MEASURED

@@ -81,7 +81,7 @@ def test_two_views_from_different_places_begin_a_map():
     truth[:3, 3] *= unit
     np.testing.assert_allclose(start.T_2_1, truth, atol=1e-3)
     np.testing.assert_allclose(start.twist, se3_log(start.T_2_1) / 0.5)
-    assert one.is_waiting  # until it is told that the map has begun
+    assert one.is_waiting  # until the map has begun
     one.reset()
     assert not one.is_waiting
 
@@ -165,7 +165,7 @@ def test_a_sub_map_takes_its_unit_from_the_speed_before():
     assert rescaled.first is start.first
     assert rescaled.second is start.second
     np.testing.assert_allclose(se3_exp(0.25 * rescaled.twist), rescaled.T_2_1, atol=1e-12)
-    assert np.linalg.norm(start.T_2_1[:3, 3]) == pytest.approx(0.5)  # as it was
+    assert np.linalg.norm(start.T_2_1[:3, 3]) == pytest.approx(0.5)  # unchanged
 
 
 @pytest.mark.parametrize(("speed", "believed"), [

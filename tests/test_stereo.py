@@ -57,7 +57,7 @@ def seen_by_both(left: Extraction, dx: float) -> np.ndarray:
 def test_integer_disparity(disparity):
     left, found = match(disparity, noise=1.0)
     matched = np.isfinite(found)
-    # The coarser levels are sampled at other phases; the median of SAD rejects many of them.
+    # Coarser levels are sampled at other phases. The median of the SAD rejects many of them.
     assert matched[(left.octave == 0) & seen_by_both(left, disparity)].mean() > 0.6
     error = np.abs(found[matched] - disparity)
     assert np.median(error[left.octave[matched] == 0]) < 0.05

@@ -41,7 +41,7 @@ from vslam.lab.loopbench.drives import render_views
 CAMERA = Camera(360.0, 360.0, 300.3, 95.7, 0.54, 620, 190)
 BY_DAY = Light(np.array([0.0, -0.8, -0.6]), visibility=1e9, haze=0.0)
 SIDE = 1024
-DOTS = 8  # a row and a column
+DOTS = 8  # in each row and column
 
 
 def straight(n=64, step=1.0):
@@ -400,11 +400,11 @@ def test_damaged_frames_are_found_and_rendered_again(tmp_path, monkeypatch, capl
     monkeypatch.setattr(store, "render_frames", fake := Renderings())
     root = store.render_sequence(small, Variation(), tmp_path)
     images = root / "sequences/short/image_0"
-    (images / "000007.png").write_bytes(b"pn")  # another size
+    (images / "000007.png").write_bytes(b"pn")  # a file of a different size
     store.render_sequence(small, Variation(), tmp_path)
     assert (fake.calls, fake.missing) == (2, [7])
     assert "rendering 1 damaged frame again: 7" in caplog.text
-    (images / "000008.png").write_bytes(b"xxx")  # the same size
+    (images / "000008.png").write_bytes(b"xxx")  # a file of the same size
     store.render_sequence(small, Variation(), tmp_path)
     assert fake.calls == 2
     store.render_sequence(small, Variation(), tmp_path, verify=True)
@@ -433,7 +433,7 @@ def test_two_processes_do_not_render_one_sequence(tmp_path, monkeypatch):
         pytest.raises(InputError, match="another process is rendering it; wait"),
     ):
         store.render_sequence(small, Variation(), tmp_path)
-    (folder / ".short.lock").touch()  # killed long ago
+    (folder / ".short.lock").touch()  # left by a killed process
     store.render_sequence(small, Variation(), tmp_path)
     assert fake.calls == 1
     assert not list(folder.glob(".short*"))

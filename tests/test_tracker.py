@@ -21,8 +21,8 @@ CONTEXT = TrackingContext.create(CAMERA, Config())
 POINTS = Points.create()
 SEEN_LAST, SEEN_NOW = slice(0, 120), slice(120, 240)  # two halves of the points
 FEW = slice(0, 60)
-STEP = np.array([0.02, 0.0, -0.8, 0.0, -0.004, 0.0])  # of the camera, between two frames
-TWIST = STEP / 0.1  # at ten frames a second
+STEP = np.array([0.02, 0.0, -0.8, 0.0, -0.004, 0.0])  # motion of the camera between two frames
+TWIST = STEP / 0.1  # at ten frames per second
 
 
 def at(k: float) -> np.ndarray:
@@ -145,7 +145,7 @@ def test_the_leap_to_where_a_frame_was_found_in_the_map_is_no_motion():
     assert drive.tracker.twist is None
 
 
-# -- what tracking goes on ------------------------------------------------------------------------
+# -- what is tracked ------------------------------------------------------------------------------
 
 
 def test_a_tracker_that_has_nothing_to_go_on_does_not_track():
@@ -173,7 +173,7 @@ def test_a_continued_drive_has_the_speed_that_it_is_told():
     drive.frames.append(0.0, at(0), tracked=True)
     drive.tracker.resume(TWIST)
     np.testing.assert_allclose(drive.predict(3), at(3), atol=1e-12)
-    # With it, a frame that the reference keyframe does not show is found at the prediction.
+    # With the prediction, a frame is found that the reference keyframe does not show.
     frame, view = drive.next_frame(), POINTS.view(nearest=NOTHING)
     assert drive.track(frame, view).n_inliers == 240
     drive.tracker.resume(None)
@@ -285,7 +285,7 @@ def test_a_small_share_of_inliers_makes_a_frame_of_a_depth_camera_lost(n_inliers
 
 # -- doubt ----------------------------------------------------------------------------------------
 
-OLD, YOUNG = 6, 5  # keyframes: a map of five is young
+OLD, YOUNG = 6, 5  # numbers of keyframes; a map with five is young
 
 
 def test_a_frame_after_a_gap_with_few_inliers_is_doubtful():
@@ -319,7 +319,7 @@ def test_a_frame_with_few_inliers_next_to_one_found_in_the_map_is_doubtful():
     assert drive.doubts(frame, POINTS.view(n_reference=121, n_keyframes=OLD))
     assert not drive.doubts(frame, POINTS.view(n_reference=120, n_keyframes=OLD))
     assert not drive.doubts(frame, POINTS.view(n_reference=121, n_keyframes=YOUNG))
-    drive.accept(4, FEW)  # from here on the motion is known
+    drive.accept(4, FEW)  # now the motion is known
     assert not drive.doubts(drive.next_frame(FEW), POINTS.view(n_reference=121, n_keyframes=OLD))
 
 

@@ -106,7 +106,7 @@ def test_gaps_are_bridged_at_constant_velocity():
     guessed = np.where(known[:, None, None], T_wc, np.eye(4))
     bridged = bridge_gaps(Trajectory(times, guessed), known)
     np.testing.assert_allclose(bridged.T_wc[:4], T_wc[:4], atol=1e-12)
-    np.testing.assert_array_equal(bridged.T_wc[4], np.eye(4))  # nothing known after it
+    np.testing.assert_array_equal(bridged.T_wc[4], np.eye(4))  # there is no known pose after it
 
 
 def test_quaternions_are_those_of_scipy_to_the_last_bit():

@@ -106,7 +106,7 @@ def test_the_matches_of_an_edge_are_right_alive_and_unique():
     shown = world.point_of_row[rows]
     meant = world.point_of_row[a.head[edge.landmarks]]
     assert np.mean(shown == meant) > 0.99
-    # The place is more than the match: seen from further back, its neighbours' landmarks take part.
+    # The place has more landmarks than the match: those of its neighbours are used, too.
     edge = check(world, query=4, match=3)
     assert edge.accepted, edge.reason
     assert np.setdiff1d(edge.landmarks, world.map.landmarks_of(edge.match)).size > 0
@@ -130,7 +130,7 @@ def test_the_map_is_only_read_and_the_answer_is_the_same_again():
 
 
 def test_a_revisit_in_other_light_is_accepted():
-    # 3 of 4 points do not look as before, those that do are all over the street.
+    # Three of four points look different. The other points are distributed over the street.
     world = street(among=np.arange(0, 900, 4))
     edge = check(world)
     assert edge.accepted, edge.reason
@@ -170,7 +170,7 @@ def test_one_object_that_looks_the_same_is_no_revisit(left, right):
     world = street(among=points)
     edge = check(world)
     assert not edge.accepted
-    assert edge.n_inliers >= CONFIG.min_inliers  # enough for ORB-SLAM
+    assert edge.n_inliers >= CONFIG.min_inliers  # ORB-SLAM would accept this number
     assert error(world, edge)[0] < 0.5
     assert "outside one third" in edge.reason or "cells" in edge.reason
 
@@ -180,7 +180,7 @@ def test_what_should_be_seen_and_is_not_speaks_against_a_loop():
     edge = check(world, CONFIG.model_copy(update={"min_seen_ratio": 0.5}))
     assert not edge.accepted
     assert edge.reason.endswith("landmarks of the place are seen")
-    # The other side: a query full of landmarks that the place does not know.
+    # Now the query has many landmarks that the place does not have.
     world = street()
     new = np.flatnonzero(world.map.arrays.landmark[world.map.rows(1)] >= 0)
     rows = new + world.map.arrays.first_row[1]

@@ -14,7 +14,7 @@ import pytest
 
 from vslam.run import warmup
 
-# In a process of its own, because other tests have called kernels in this one.
+# In a separate process, because other tests have called kernels in this one.
 SHARES = """
 import gc
 from numba.core.dispatcher import Dispatcher

@@ -26,7 +26,7 @@ from vslam.slam import Slam
 
 ORB = OrbConfig(n_features=800)
 CONFIG = Config(orb=ORB)
-# Nothing is measured to be noisy or faint: as images were extracted before.
+# With these thresholds, no image counts as noisy or faint.
 NEVER = WeakImageConfig(noise_from=1e9, spikes_from=1.0, low_contrast=0.0)
 BEFORE = Config(orb=ORB, weak_images=NEVER)
 CAMERA = Camera(300.0, 300.0, 200.0, 100.0, 0.5, 400, 200)
@@ -107,7 +107,7 @@ def test_spikes_are_counted_and_taken_out(share):
     clean = camera_image(scene(grain_px=4.0)[0])
     image = spiked(clean, share, seed=3)
     _, spikes = grain(image, ROW_STRIDE, LEAST_SPIKE)
-    # One with a spike of its own colour beside it, or like the scene, does not stand out.
+    # A spike next to one of the same colour, or one that resembles the scene, does not stand out.
     assert 0.4 * share < spikes < share
     (mended,) = without_noise([image], CONFIG.weak_images)
     error = [float(np.abs(one.astype(float) - clean).mean()) for one in (image, mended)]

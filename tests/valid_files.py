@@ -244,7 +244,7 @@ def _drive(places: range, seed: int) -> Slam:
 def drive_on(slam: Slam, places: range, seed: int, start: float) -> None:
     from vslam.features import Extracted, Features
 
-    camera = slam.context.camera  # the camera of a map may differ
+    camera = slam.context.camera  # the camera of the map may differ
     for i, place in enumerate(places):
         seen = _ring().see(place, seed)
         inside = (seen.xy < (camera.width, camera.height)).all(1)

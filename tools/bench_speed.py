@@ -51,9 +51,9 @@ does neither. For a fair comparison, vslam also runs with `--no-report` and with
 - **Whole process** is the time from the start of Python to its end. It includes reading the \
 vocabulary, loading the kernels from Numba's cache and writing all files.
 - **Frame loop** is the time from the first image to the last pose.
-- **The same without reading images.** The CPU time for decoding both images of a frame is \
-measured in separate processes: with vslam's own reader for vslam, and with `cv2.imread` for \
-ORB-SLAM3. The rows with this name subtract it.
+- **The same without reading images.** In the rows with this name, the CPU time for decoding both \
+images of a frame is subtracted. This time was measured in separate processes: with vslam's own \
+reader for vslam, and with `cv2.imread` for ORB-SLAM3.
 - **Real-time run and profile.** Each of them is done once per case. `tools/profile_frame.py` \
 takes the profile, with one thread.
 """
@@ -466,10 +466,10 @@ def setting_of(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) ->
     machine = report["machine"]
     ours = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
     return (
-        f"The comparisons give the median (least - greatest) of {repeats} runs of each system. The "
-        f"systems ran alternately, on {time.strftime('%Y-%m-%d')}. The machine was: "
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. The versions were: "
-        f"{ours}{version}."
+        f"The comparisons give the median (minimum - maximum) of {repeats} runs of each system. "
+        f"The systems ran alternately, on {time.strftime('%Y-%m-%d')}. Machine: "
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. Versions: "
+        f"{ours}{version}. *method* is the version of the SLAM method (`vslam.METHOD_VERSION`)."
     )
 
 

@@ -1,4 +1,4 @@
-"""Make the tables and figures of README and the documentation from runs, and check them.
+"""Make the tables and figures of the documentation from runs, and check that they are up to date.
 
     python tools/figures.py [--quick] [--only TEXT]    # make figures, make figures FIGURES=quick
     python tools/figures.py --check                    # make figures-check

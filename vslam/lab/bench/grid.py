@@ -182,7 +182,7 @@ def draws(perturb: str) -> bool:
 
 
 def read_report(folder: Path) -> ReportJson | None:
-    """Read the report of a run; None if it is missing or has a different schema."""
+    """Read the report of a run. Return None if it is missing or has an unknown schema."""
     try:
         return ReportJson.read(folder / "report.json")
     except InputError:

@@ -21,10 +21,10 @@ _CELL_BYTES, _FRAME_BYTES, _SCRATCH_FRAME_BYTES = 100_000, 1_000, 45_000
 
 @dataclass(frozen=True)
 class Estimate:
-    """The time and the disk space that a benchmark needs.
+    """The time and the disk space that the missing runs of a benchmark need.
 
     Attributes:
-        seconds: estimated wall time of the whole benchmark.
+        seconds: estimated wall time of all missing runs together.
         kept: size in bytes of the files that are kept.
         scratch: size in bytes of the files that are deleted after each run.
         basis: text that says on what ``seconds`` is based.

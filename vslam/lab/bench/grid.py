@@ -120,7 +120,7 @@ def make_grid(
 ) -> list[Cell]:
     """List all cells (runs) of a benchmark.
 
-    The first seed of all sequences comes first, so that the results of an interrupted benchmark are
+    The runs with the first seed come first, so that the results of an interrupted benchmark are
     useful.
 
     A perturbation that is not random is run with only one seed. Its runs with other seeds would be

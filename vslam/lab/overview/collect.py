@@ -222,10 +222,7 @@ def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
 
 
 def _name_by_settings(found: Found) -> None:
-    """Append the settings to the names of the systems, so that different settings are compared.
-
-    Settings that are the same in all runs are not listed.
-    """
+    """Append the settings to the names of the systems, except settings that all runs share."""
     first = found.runs[0].settings
     shared = {
         name: value

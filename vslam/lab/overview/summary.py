@@ -119,7 +119,7 @@ def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list
 
 
 def _is_called(system: str, name: str | None) -> bool:
-    """Return whether the user means a system by a name.
+    """Return whether a name that the user gave refers to a system.
 
     The name may omit the settings of the system and the suffix ``, mono``.
     """

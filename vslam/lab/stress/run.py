@@ -70,7 +70,7 @@ def run_all(
 def _wanted(search: Search, results: Results) -> Cell | None:
     """Return the next cell (run) of a search.
 
-    None if the search has ended, or if the run on unperturbed images gave no results.
+    Returns None if the search has ended, or if the run on unperturbed images gave no results.
     """
     return search.wants() if isinstance(results(search.clean), ReportJson) else None
 

@@ -13,8 +13,8 @@ class Tested(Record):
     """One run of a stress test, at one strength of a perturbation.
 
     - ``verdict``: why the run failed; empty if it did not fail.
-    - ``absolute``: why the run exceeded the limits of `criterion.absolute_verdict`; empty if it did
-      not.
+    - ``absolute``: why the run exceeded the absolute limits, which do not depend on the run on
+      unperturbed images; empty if it did not exceed them.
     """
 
     strength: float

@@ -1,8 +1,8 @@
-"""Sphinx: the documentation site (``make docs``).
+"""Configuration of the documentation site, which Sphinx builds (``make docs``).
 
-Sphinx with furo and MyST rather than MkDocs: docstrings carry Sphinx's roles already, autodoc
-imports the package as it is installed (three of its folders lie outside ``vslam/``), and the theme
-asks no other host for fonts or scripts.
+The site uses Sphinx with furo and MyST instead of MkDocs, for three reasons. The docstrings already
+have Sphinx's roles. autodoc imports the package as it is installed, and three of its folders lie
+outside ``vslam/``. The theme loads no fonts or scripts from other hosts.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False
 pygments_style, pygments_dark_style = "tango", "monokai"
-smartquotes = False  # two hyphens begin an option, they are no dash
+smartquotes = False  # two hyphens are the start of an option, not a dash
 suppress_warnings = ["myst.header", "misc.highlighting_failure"]
 
 autodoc_member_order = "bysource"
@@ -44,7 +44,7 @@ default_role = "py:obj"
 myst_heading_anchors = 4
 myst_links_external_new_tab = False
 
-# Pages that lie elsewhere in the repository, by their path there.
+# Pages whose files are outside docs/: path in the repository, and path on the site.
 _PAGES = {
     "datasets.md": "reference/datasets.md",
     "CONTRIBUTING.md": "about/contributing.md",
@@ -55,8 +55,10 @@ _LINK = re.compile(r"\[([^]]*)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)\s]*)?\)")
 
 
 def _mend_links(path: Path, text: str) -> str:
-    """Links between files of the repository become links between pages of the site; a folder or a
-    source file is named without a link."""
+    """Turn links between files of the repository into links between pages of the site.
+
+    A folder or a source file is named without a link.
+    """
 
     def mended(found: re.Match[str]) -> str:
         words, link, anchor = found[1], found[2], found[3] or ""
@@ -89,14 +91,17 @@ _ARRAY = re.compile(
 
 
 def _shorten_signature(app, what, name, thing, options, signature, returned):
-    """Arrays as the source writes them; a protocol is not constructed."""
+    """Write array types as in the source. Hide the constructors of protocols."""
     if getattr(thing, "_is_protocol", False):
         return "", ""
     return tuple(text and _ARRAY.sub(r"NDArray[\1]", text) for text in (signature, returned))
 
 
 def _join_names(app, what, name, thing, options, lines):
-    """Sphinx takes the first of several names, as in ``fx, fy: focal lengths``, for a type."""
+    """Remove the spaces in lists of names such as ``fx, fy: focal lengths``.
+
+    Otherwise, Sphinx would take the first name for a type.
+    """
     for k, line in enumerate(lines):
         if line.startswith(":ivar "):
             names, colon, text = line.removeprefix(":ivar ").partition(":")
@@ -104,7 +109,7 @@ def _join_names(app, what, name, thing, options, lines):
 
 
 def _draw_dashes(app, doctree, docname):
-    """The dash between a parameter and its description, which Sphinx leaves to ``smartquotes``."""
+    """Draw the dash between a parameter and its description, because ``smartquotes`` is off."""
     for text in list(doctree.findall(nodes.Text)):
         if text == " -- ":
             text.parent.replace(text, nodes.Text(" \N{EN DASH} "))

@@ -1,4 +1,4 @@
-"""Pages of the site that are made from the program: its commands, and its modules."""
+"""Generates the reference pages of the commands and of the modules from the code."""
 
 from __future__ import annotations
 
@@ -37,7 +37,6 @@ MODULES = (
 
 
 def write_reference(folder: Path) -> None:
-    """Write ``commands.md`` and a page for each module into a folder."""
     (folder / "commands.md").write_text(commands_page())
     generated = folder / "generated"
     shutil.rmtree(generated, ignore_errors=True)
@@ -49,7 +48,10 @@ def write_reference(folder: Path) -> None:
 
 
 def module_rows() -> list[str]:
-    """The table of docs/reference/modules.md: each module with the first sentence about it."""
+    """Return the rows of the table in docs/reference/modules.md.
+
+    Each row has a module and the first paragraph of its docstring.
+    """
     rows = []
     for name in MODULES:
         origin = find_spec(name).origin
@@ -61,13 +63,13 @@ def module_rows() -> list[str]:
 
 
 def commands_page() -> str:
-    """Every command with its arguments and options, from the command line itself."""
+    """Return the page with the arguments and options of every command."""
     import typer
 
     from vslam.cli.main import app
 
-    lines = ["# Commands", "", "Made from the command line itself; `vslam COMMAND --help` shows"]
-    lines += ["the same.", ""]
+    lines = ["# Commands", "", "This page is generated from the code of the command line."]
+    lines += ["`vslam COMMAND --help` prints the same descriptions.", ""]
     for name, command in _commands("vslam", typer.main.get_command(app)):
         lines += [f"## `{name}`", "", _plain(command.help or ""), ""]
         options = [_row(p) for p in command.params if p.name != "help"]
@@ -80,7 +82,6 @@ def commands_page() -> str:
 
 
 def _commands(name, command):
-    """Commands without sub-commands, in their order."""
     inner = getattr(command, "commands", None)
     if not inner:
         return [(name, command)]
@@ -107,14 +108,14 @@ def _row(parameter) -> str:
 
 
 def _marked_up(text: str) -> str:
-    """Options that a sentence names as code, pages as links."""
+    """Format options in a sentence as code, and names of pages as links."""
     text = re.sub(r"docs/(\w+/(\w+)\.md)", r"[\2](../\1)", text)
-    parts = text.split("`")  # every second part is code already
+    parts = text.split("`")  # every second part is already code
     parts[::2] = [re.sub(r"(?<![\w-])(--[a-z][a-z-]*)", r"`\1`", part) for part in parts[::2]]
     return "`".join(parts)
 
 
 def _plain(text: str) -> str:
-    """Without Rich's markup."""
+    """Remove the markup of Rich."""
     text = re.sub(r"\[b\](.*?)\[/b\]", r"`\1`", text)
     return text.replace("\\[", "[").strip()

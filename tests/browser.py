@@ -14,7 +14,7 @@ import pytest
 
 
 def chromium() -> str:
-    """The path of the browser. The test is skipped if there is none."""
+    """Return the path of the browser. The test is skipped if there is none."""
     found = next(
         filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
     )
@@ -32,7 +32,7 @@ def dumped(
     timeout: float = 180.0,
     on_request: Callable[[str], object] = lambda path: None,
 ) -> str:
-    """The rendered HTML of a page in a folder, which is served locally.
+    """Render a page of a folder, which is served locally, and return its HTML.
 
     Args:
         milliseconds: virtual time that the scripts of the page get.

@@ -1,7 +1,4 @@
-"""Fixtures that several test files use.
-
-They include a rendered stereo world, a check of maps, and calls of the command line.
-"""
+"""Fixtures that several test files use."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ from vslam.map import Map
 from vslam.trajectory import write_kitti
 
 METRES_PER_TEXEL = 0.02
-PLANES = (  # normal . X = offset, in the world frame (x right, y down, z forward)
+PLANES = (  # normal . X = offset in metres, in the world frame (x right, y down, z forward)
     (np.array([0.0, 1.0, 0.0]), 1.5),  # ground
     (np.array([1.0, 0.0, 0.0]), -4.0),  # left wall
     (np.array([1.0, 0.0, 0.0]), 4.5),  # right wall

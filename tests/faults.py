@@ -1,8 +1,8 @@
 """Injection of faults: each part of a run fails once, at a call that is drawn from a seed.
 
-A run drives along a ring of points (tests/ring.py). The images only encode the index of the frame.
-The features are computed from this index. Therefore, a lap with a closed loop, lost frames and all
-results takes only two seconds.
+The simulated camera moves along a ring of points (tests/ring.py). Its images only encode the index
+of the frame, from which the features are computed. Therefore, a lap with a closed loop, lost frames
+and all results takes only two seconds.
 
 Each injection runs the entry point of the command line in a fork of a process that has loaded
 everything. ``inject`` judges the messages and files of the run.
@@ -64,7 +64,7 @@ class Point:
     """A point at which a run may fail.
 
     Attributes:
-        name: name of the part that fails, for people.
+        name: name of the part that fails.
         function: dotted path of the function, as it is looked up when the function is called.
         last_call: number of calls from which the failing call is drawn.
         expected: one of the outcomes above.
@@ -81,7 +81,7 @@ class Point:
 
 
 REALTIME = ("--realtime", "--max-frames", "12")
-LATER = ("report.json", "report.md", "report.html", "figures")  # made from all other results
+LATER = ("report.json", "report.md", "report.html", "figures")  # written after all other results
 POINTS = (
     Point("a frame's track", "vslam.frontend.tracker.Tracker.track", 200, EARLY),
     Point("keyframe policy", "vslam.modes.MapBuilding.update_map", 200, EARLY),
@@ -161,15 +161,15 @@ class Row:
 
 
 def next_image() -> None:
-    """Called before the source yields a frame."""
+    """Is called before the source yields a frame."""
 
 
 def read_image() -> None:
-    """Called before a frame is read."""
+    """Is called before a frame is read."""
 
 
 def on_frame() -> None:
-    """Called when a frame has been processed."""
+    """Is called when a frame has been processed."""
 
 
 def failing(
@@ -195,7 +195,7 @@ def failing(
 
 
 def _owner(path: str) -> tuple[Any, str]:
-    """The module or class that has the attribute at the end of a dotted path."""
+    """Return the owner of the attribute at the end of a dotted path, and the attribute's name."""
     parts = path.split(".")
     for n in range(len(parts) - 1, 0, -1):
         with contextlib.suppress(ModuleNotFoundError):
@@ -229,7 +229,7 @@ def write_ring(root: Path) -> None:
 
 
 def stage(*, learned: bool) -> None:
-    """Make this process drive along the ring, with a detector that knows the places.
+    """Replace the features and the detector of this process with those of the ring.
 
     The contents of the images do not matter. If ``learned`` is set, learned descriptors may verify
     the loops.
@@ -271,7 +271,6 @@ def stage(*, learned: bool) -> None:
 
 @cache
 def view(k: int) -> Features:
-    """The features that the camera sees at a frame."""
     return Features.none() if k in DARK else RING.see(float(k), 1)
 
 
@@ -338,7 +337,7 @@ def _run(words: list[str], log: Path, fault: Callable[[], None], *, learned: boo
     except BaseException:
         traceback.print_exc()
         code = 1
-    threading._shutdown()  # Python does the same when it ends, and may wait for ever
+    threading._shutdown()  # Python does the same when it exits, and may then wait forever
     atexit._run_exitfuncs()
     sys.stderr.flush()
     return code
@@ -410,7 +409,7 @@ RESULTS = (
 def _look(
     point: Point, folder: Path, whole: bytes, results: tuple[str, ...]
 ) -> tuple[str, list[str]]:
-    """Load all results of a run. Returns the results that exist, and what is wrong with them."""
+    """Load all results of a run. Return the results that exist, and what is wrong with them."""
     costs = (*point.costs, *(["map.npz"] if point.expected == MAPLESS else []))
     wrong = [f"no {name}" for name in results if name not in costs and not (folder / name).exists()]
     wrong += [f"a useless {path.name}" for path in folder.glob(".*.part")]

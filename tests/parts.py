@@ -37,12 +37,11 @@ def frame_of(
     image: np.ndarray | None = None,
     camera: Camera = CAMERA,
 ) -> Frame:
-    """Make a frame that is not tracked yet."""
     return Frame.of(Extracted(features), camera, index, timestamp, image)
 
 
 def ahead(metres: float, turn: float = 0.0) -> np.ndarray:
-    """``T_cw`` of a camera that moved forward from the origin and turned right by ``turn`` rad."""
+    """Return ``T_cw`` of a camera that moved forward and turned right by ``turn`` radians."""
     return se3_exp(np.array([0.0, 0.0, -metres, 0.0, -turn, 0.0]))
 
 
@@ -79,7 +78,7 @@ class Points:
         return cls(np.stack([x, y, z], axis=1), descriptors)
 
     def see(self, T_cw: np.ndarray, among: slice = ALL) -> Features:
-        """The features of some of the points, in their order. The camera must see all of them."""
+        """Return the features of some points, in their order. The camera must see all of them."""
         uvr = CAMERA.project(transform(T_cw, self.xyz[among])).astype(np.float32)
         n = len(uvr)
         return Features(
@@ -91,13 +90,11 @@ class Points:
         )
 
     def frame(self, index: int, timestamp: float, T_cw: np.ndarray, among: slice = ALL) -> Frame:
-        """A frame that sees some of the points and is not tracked yet."""
         return frame_of(self.see(T_cw, among), index, timestamp)
 
     def tracked_frame(
         self, index: int, timestamp: float, T_cw: np.ndarray, among: slice = ALL
     ) -> Frame:
-        """A frame at its true pose that tracks all the points that it sees."""
         frame = self.frame(index, timestamp, T_cw, among)
         frame.T_cw = T_cw
         frame.landmark[:] = np.arange(len(self.xyz), dtype=np.int32)[among]
@@ -105,7 +102,6 @@ class Points:
         return frame
 
     def landmarks(self, among: slice = ALL) -> LocalMap:
-        """Some of the points as the landmarks of a local map."""
         xyz = self.xyz[among]
         distance = np.linalg.norm(xyz, axis=1)
         return LocalMap(
@@ -126,7 +122,7 @@ class Points:
     ) -> MapView:
         """Make a view of a map.
 
-        The points ``around`` are in the local map, and the points ``nearest`` are in the reference
+        The points ``around`` are in its local map, and the points ``nearest`` are in its reference
         keyframe.
         """
         return MapView(

@@ -2,8 +2,7 @@
 
 One extractor computes a global descriptor and local descriptors (HF-Net, Sarlin et al., CVPR 2019).
 Matches are found on a coarse grid and refined to subpixels on a fine grid (LoFTR, Sun et al., CVPR
-2021). The extractor is that of the shipped network and is not trained. Only a small head is
-trained.
+2021). The extractor is that of the shipped network. Only a small head is trained.
 
 Cell ``(row, column)`` of a grid of stride s lies at the pixel ``(s column, s row)``.
 """
@@ -35,8 +34,6 @@ class Separable(nn.Module):
 
 
 class LocalHead(nn.Module):
-    """Computes descriptors at strides 16 and 4 from features at strides 4, 8 and 16."""
-
     def __init__(self) -> None:
         super().__init__()
         self.read16 = nn.Conv2d(112, _HIDDEN, 1)
@@ -68,14 +65,12 @@ class LocalHead(nn.Module):
 
 
 class LocalNetwork(nn.Module):
-    """Computes local descriptors of an image."""
-
     def __init__(self, extractor: LiteExtractor, head: LocalHead) -> None:
         super().__init__()
         self.extractor, self.head = extractor, head
 
     def features(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Features at strides 4, 8 and 16 of ``(N, 1, H, W)`` float32 images in [0, 1]."""
+        """Compute features at strides 4, 8 and 16 of ``(N, 1, H, W)`` float32 images in [0, 1]."""
         x = standardised(image, textured(image))
         x = functional.relu6(self.extractor.stem(x))
         kept = []

@@ -49,10 +49,7 @@ def _framed(image: np.ndarray, margin: int, scale: float) -> tuple[np.ndarray, f
 
 
 def _aprilgrid(board: Board, border: int, upright: bool) -> tuple[np.ndarray, float, np.ndarray]:
-    """Draw an AprilGrid.
-
-    The tags are in rows from the lower left. A black square is in every corner between tags.
-    """
+    """Draw an AprilGrid. A black square is in every corner between tags."""
     tag = (6 + 2 * border) * BIT
     pitch = round(tag * board.square / board.marker)
     gap = pitch - tag
@@ -73,8 +70,6 @@ def _aprilgrid(board: Board, border: int, upright: bool) -> tuple[np.ndarray, fl
 
 
 class Renderer:
-    """Renders images of one board for one camera."""
-
     def __init__(self, board: Board, model: CameraModel, **printed: bool | int) -> None:
         self.printed, self.scale, self.origin = texture(board, **printed)
         self.up = board.kind == "aprilgrid"

@@ -22,9 +22,9 @@ class Ring:
     """Points on both sides of a ring road, each with its own descriptor.
 
     The calibrated focal length is too long by ``focal_error``. Therefore, turns are estimated with
-    an error, and a lap does not end at its start. With ``zoom``, a point is found in the octave
-    that corresponds to its distance, otherwise in octave 0. The right image is taken
-    ``right_delay`` seconds late. The frame rate is 10 Hz.
+    an error, and a lap does not end at its start. With ``zoom``, the octave of a feature depends on
+    the distance of the point. Otherwise, it is 0. The right image is taken ``right_delay`` seconds
+    late. The frame rate is 10 Hz.
     """
 
     points: np.ndarray
@@ -46,7 +46,7 @@ class Ring:
         return cls(points, rng.integers(0, 256, (n, 32), dtype=np.uint8), focal_error, zoom)
 
     def pose(self, k: float) -> np.ndarray:
-        """``T_wc`` at frame k. Seen from below, the camera drives counter-clockwise."""
+        """Return ``T_wc`` at frame k. Seen from below, the camera moves counter-clockwise."""
         angle = k * STEP / RADIUS
         forward = np.array([-np.sin(angle), 0.0, np.cos(angle)])
         T = np.eye(4)
@@ -57,10 +57,7 @@ class Ring:
         return T
 
     def see(self, k: float, seed: int) -> Features:
-        """The features at frame k.
-
-        They have as much noise as those of real images. Six bits of each descriptor are wrong.
-        """
+        """Return the noisy features at frame k. Six bits of each descriptor are wrong."""
         rng = np.random.default_rng((seed, round(10 * k)))
         T_cw = inverse(self.pose(k))
         p = self.points @ T_cw[:3, :3].T + T_cw[:3, 3]
@@ -91,7 +88,7 @@ class Ring:
 
 
 class Oracle:
-    """A detector that knows where each frame was taken.
+    """A detector that knows where each frame was taken, from the index in its image.
 
     ``frames`` are the places of the frames of the run.
     """

@@ -1,4 +1,4 @@
-"""Small networks and small sets of images, which several tests of the Siamese networks use."""
+"""Small networks and small sets of images for tests of the Siamese networks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def small_settings(**changes: object) -> TrainSettings:
 
 
 def views(places: int, seed: int = 0) -> Collection:
-    """Make two images of each of some places.
+    """Make two images of each place.
 
     The images show blobs. In the second image, they are shifted by 3 pixels and darker.
     """

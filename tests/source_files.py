@@ -24,7 +24,6 @@ LEFT, RIGHT = "/cam0/image_raw", "/cam1/image_raw"
 def open_from(
     dataset: str, data: Path | str, options: SourceOptions = NO_OPTIONS, **more: object
 ) -> Source:
-    """Open a source as a command with these options does."""
     given = {"dataset": dataset, "data": str(data), **more}
     return open_source(options.model_copy(update=given))
 
@@ -32,7 +31,7 @@ def open_from(
 def write_calibration(
     path: Path, camera: Camera, *, mono: bool = False, scale: float = 1.0
 ) -> Path:
-    """Write a calibration in vslam's own format. It is written as JSON, which is valid YAML."""
+    """Write a calibration in vslam's own format, as JSON, which is valid YAML."""
     one = {
         "size": [round(scale * camera.width), round(scale * camera.height)],
         "focal": [camera.fx, camera.fy],
@@ -44,7 +43,6 @@ def write_calibration(
 
 
 def write_images(folder: Path, sides: dict[str, list[np.ndarray]], names: list[str]) -> Path:
-    """Write the images ``folder/SIDE/NAME`` of each side."""
     for side, images in sides.items():
         (folder / side).mkdir(parents=True, exist_ok=True)
         for name, image in zip(names, images, strict=True):
@@ -55,7 +53,7 @@ def write_images(folder: Path, sides: dict[str, list[np.ndarray]], names: list[s
 def write_video(
     path: Path, images: list[np.ndarray], fps: float = 10.0, codec: str = "FFV1"
 ) -> Path:
-    """Write a video, which is lossless with the codec FFV1. Colours are blue, green, red."""
+    """Write a video, which is lossless with the codec FFV1. Colour images are BGR."""
     height, width = images[0].shape[:2]
     fourcc, colour = cv2.VideoWriter_fourcc(*codec), images[0].ndim == 3
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, fps, (width, height), colour)
@@ -84,7 +82,7 @@ def encoded(image: np.ndarray, encoding: str) -> np.ndarray:
 
 
 def compressed(image: np.ndarray, kind: str) -> tuple[str, np.ndarray]:
-    """The format and the bytes of a compressed image, or of depth in mm (``compressed_depth``)."""
+    """Return the format and the bytes of a compressed image, or of depth in mm."""
     if kind == "png":
         return kind, cv2.imencode(".png", image)[1].ravel()
     a, b = np.float32(500.0), np.float32(-3.0)  # the PNG contains a / metres + b
@@ -116,14 +114,14 @@ def write_bag(
 
     Args:
         kind: ``ros1``, ``ros2``, ``mcap``, or ``folder`` for a ROS 2 bag of MCAP files.
-        stamps: time stamps in nanoseconds.
+        stamps: timestamps in nanoseconds.
         encoding: encoding of the images, or ``png`` for compressed images.
-        depth_encoding: encoding of sides with uint16 depth in mm: ``16UC1`` or ``32FC1``. `` png``
-            is appended for compressed depth.
+        depth_encoding: ``16UC1`` or ``32FC1``, for sides with uint16 depth in mm. `` png`` is
+            appended for compressed depth.
         camera: camera whose camera_info is written; None writes no camera_info.
-        baseline: whether the camera_info has the baseline, in P of the right camera.
+        baseline: whether P of the right camera contains the baseline.
         calibrated: whether the camera_info is calibrated. Otherwise, it is all zero.
-        lag: delay of the time stamps of the second side in nanoseconds.
+        lag: delay of the timestamps of the second side in nanoseconds.
         padding: number of bytes after each row.
         compression: ``bz2`` or ``lz4`` for ROS 1; ``file``, ``message`` or ``storage`` for ROS 2.
     """
@@ -217,13 +215,11 @@ def all_sources(root: Path, corridor, n: int) -> Path:
 
 
 def source_path(root: Path, kind: str) -> Path:
-    """The path to which `all_sources` wrote a kind of source."""
     files = {"images": "images", "video": "pair.mkv", "ros1": "ros1.bag", "ros2": "ros2",
              "mcap": "mcap/mcap.mcap", "folder": "bag"}  # fmt: skip
     return root / files[kind]
 
 
 def run_source(source, *, threads: int = 2, perturb: str = "none", **more) -> RunOutcome:
-    """Run odometry on a whole source. ``more`` are additional settings."""
     settings = RunOptions(detector="none", perturb=perturb, threads=threads, **more)
     return run_sequence(source, parse_perturbation(perturb, 0), settings, Recorder())

@@ -1,4 +1,4 @@
-"""Noise of stereo observations, as large as the weights of a stereo camera assume."""
+"""Noise of stereo observations with the variances that the weights of a stereo camera assume."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ WHITENING = np.diag([1.0, 1.0, DISPARITY_WEIGHT]) @ np.array([[1.0, 0, 0], [0, 1
 
 
 def white_noise(rng: np.random.Generator, stereo: np.ndarray) -> np.ndarray:
-    """``(N, 3)`` random errors of u, v and u_right.
+    """Draw ``(N, 3)`` random errors of u, v and u_right.
 
     The errors of a stereo observation have one standard deviation at octave 0. The errors of u and
     v of a monocular observation have one pixel.

@@ -1,4 +1,4 @@
-"""A stub for ``vslam run``, which quickly writes the folder of a run with invented figures.
+"""A stub for ``vslam run``, which quickly writes the folder of a run with invented results.
 
 Files in ``$STUB_FOLDER`` change the behaviour of a run. NAME consists of the sequence, the
 perturbation, the detector and the seed, joined by ``-``:
@@ -9,8 +9,7 @@ perturbation, the detector and the seed, joined by ``-``:
 - ``unwritten-NAME``: the run exits with 1 after it has written the report.
 - ``hold-NAME``: the run waits as long as this file exists.
 
-Each start of a run adds a line to the file ``started``. The line contains NAME and the process
-number of the parent.
+Each run adds a line with its NAME and the process id of its parent to the file ``started``.
 """
 
 from __future__ import annotations
@@ -26,14 +25,13 @@ COMMAND = (sys.executable, str(Path(__file__).resolve()))
 
 
 def started(stub: Path) -> list[tuple[str, int]]:
-    """NAME and the parent's process number of each start so far, in order."""
+    """Return NAME and the process id of the parent of each run so far, in order."""
     file = stub / "started"
     lines = [line.split() for line in file.read_text().splitlines()] if file.exists() else []
     return [(name, int(parent)) for name, parent in lines]
 
 
 def wait_for(condition: Callable[[], object], seconds: float = 120.0) -> None:
-    """Wait until a condition is true. The test fails if that takes too long."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"

@@ -1,7 +1,4 @@
-"""Sub-pixel alignment is exact on patches of a known scene.
-
-Patches without a match are rejected.
-"""
+"""Sub-pixel alignment is exact on patches of a known scene."""
 
 from dataclasses import replace
 
@@ -35,20 +32,14 @@ NO_SHIFT = np.zeros((1, 2), np.float32)
 
 
 def seen(scene, x=0.0, y=0.0, zoom=1.0, gain=1.0, offset=0.0):
-    """Return the ``(1, PATCH_PIXELS)`` patch of a scene.
-
-    The origin of the scene is at x, y from the middle of the patch.
-    """
+    """Return the ``(1, PATCH_PIXELS)`` patch of a scene whose origin is at x, y from its middle."""
     at = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
     u, v = np.meshgrid((at - x) / zoom, (at - y) / zoom)
     return np.rint(np.clip(gain * scene(u, v) + offset, 0, 255)).astype(np.uint8).reshape(1, -1)
 
 
 def random_scene(seed):
-    """Make a scene of waves in all directions.
-
-    The waves are at least 6 pixels long, which is about what the blur of a lens leaves.
-    """
+    """Make a scene of waves in all directions, at least 6 pixels long, like a blurred image."""
     rng = np.random.default_rng(seed)
     waves = rng.uniform(0.3, 1.0, 12)
     turn, phase = rng.uniform(0, 2 * np.pi, (2, 12))
@@ -173,10 +164,7 @@ def extracted_at(u, v, octave, n):
 
 
 def one_landmark(shift=0.0):
-    """Make a map of one keyframe with a landmark 10 m ahead.
-
-    Also return the patches of the keyframe.
-    """
+    """Make a map of one keyframe with a landmark 10 m ahead, and the patches of the keyframe."""
     map_ = Map(CONTEXT.scales)
     patch = seen(random_scene(1))
     keyframe = map_.add_keyframe(features_at(320, 240, 2, 1), np.eye(4), 0.0, 0)
@@ -216,7 +204,7 @@ def test_a_landmark_has_the_patch_of_the_newest_keyframe_that_observes_it():
     known, pixels, _ = patches_of(map_, [0], recent)
     assert np.array_equal(pixels, second)
     assert known.T_cw[known.view, 2, 3].tolist() == [-2.0]
-    # A keyframe that is forgotten, and one that has no longer anything to do with the landmark.
+    # One keyframe is forgotten, and another one no longer observes the landmark.
     assert np.array_equal(patches_of(map_, [0], recent, capacity=2)[1], second)
     assert len(patches_of(map_, [0], recent, capacity=1)[1]) == 0
     unlink(map_.arrays, 1)
@@ -245,7 +233,7 @@ def test_landmarks_that_no_recent_keyframe_observes_have_none():
 
 
 def wide_scene(texture):
-    """Return what a camera sees of the plane 10 m ahead of the world's origin."""
+    """Return the image of a plane 10 m ahead of the world's origin."""
 
     def image(T_cw):
         u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
@@ -268,10 +256,6 @@ def wide_scene(texture):
     ],
 )
 def test_matches_are_aligned_however_the_camera_has_moved(motion):
-    """Matches are accurate to a tenth of a pixel after alignment.
-
-    Before it, keypoints are up to a pixel away from the points that they match.
-    """
     image = wide_scene(random_scene(4))
     T_cw = se3_exp(np.array(motion))
     rng = np.random.default_rng(0)
@@ -372,7 +356,7 @@ def test_the_map_knows_how_sure_each_observation_is(two_keyframes):
     pixels, shift = known.pixels[known.where], known.shift[known.where]
     map_ = mapper.complete()
     sure = Config().alignment.certainty
-    # Tracked and aligned; tracked only; the first to see its landmark.
+    # One feature is tracked and aligned, one is only tracked, and one is new.
     assert map_.arrays.certainty[map_.rows(1)].tolist() == [sure, 1, sure]
     assert map_.arrays.xy[map_.rows(1)][0].tolist() == [100.5, 49.75]
     assert np.array_equal(pixels[0], IMAGE[42:59, 92:109].ravel())

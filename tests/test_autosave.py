@@ -1,7 +1,4 @@
-"""A killed run loses little work.
-
-Its autosave can be loaded, and the run resumes at the next frame.
-"""
+"""The autosave of a killed run can be loaded, and the run resumes at the next frame."""
 
 from __future__ import annotations
 
@@ -58,7 +55,7 @@ from test_autosave import drive
 
 def on_frame(result):
     if result.index == int(sys.argv[3]):
-        while not (Path(sys.argv[2]) / "autosave.npz").exists():  # a slow disk
+        while not (Path(sys.argv[2]) / "autosave.npz").exists():  # the disk may be slow
             time.sleep(0.01)
         os.kill(os.getpid(), signal.SIGKILL)
 
@@ -76,7 +73,7 @@ def drive(
     compare: tuple[str, ...] = (),
     **options: object,
 ) -> RunOutcome:
-    """Run over the corridor. If a folder is given, save whenever possible."""
+    """Run vslam on the corridor. If a folder is given, save whenever possible."""
     sequence = change(open_sequence("kitti", root, "00"))
     settings = RunOptions(detector="bow", threads=2, thresholds=config, compare=compare)
     autosave = {} if folder is None else {"autosave": FolderAutosave(folder, 1e-6, "kitti 00")}
@@ -157,14 +154,13 @@ def test_ctrl_c_ends_a_run_and_a_save_is_offered_while_frames_are_dropped(kitti_
 
 
 def with_times(source: Source, times: np.ndarray) -> Source:
-    """Return the first frames of a source with different times."""
     timed = zip(source.stored[: len(times)], times.tolist(), strict=True)
     stored = tuple(replace(frame, timestamp=time) for frame, time in timed)
     return replace(source, stored=stored, ground_truth=None)
 
 
 def black_until(source: Source, index: int) -> Source:
-    """Return a source whose right images are black until a given frame."""
+    """Return a source whose right images are black before the frame ``index``."""
 
     def read(k, image_map):
         left, right = source.read(k, image_map)
@@ -207,7 +203,7 @@ def test_a_map_is_saved_where_every_frame_becomes_a_keyframe(kitti_tree, tmp_pat
 
     def look(result: TrackResult) -> None:
         if (tmp_path / MAP).exists():
-            # The writer may be between the two files: the map is of no later frame than the rest.
+            # The writer may be between two files. The map must not be newer than the other file.
             frames = load_map(tmp_path / MAP).frames
             assert frames is not None
             saved.append(len(frames.timestamp))
@@ -363,7 +359,7 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     done = vslam("run", *words, *brief, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     folder = (tmp_path / "runs" / "latest").resolve()
-    assert not (folder / MAP).exists()  # the run is whole
+    assert not (folder / MAP).exists()  # the run is complete
     refused = vslam("run", "--resume", folder, "--seed", 2, *brief, cwd=tmp_path)
     assert refused.returncode == 2
     assert refused.stderr == (
@@ -372,7 +368,7 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     nothing = vslam("run", "--resume", folder, *brief, cwd=tmp_path)
     assert nothing.returncode == 2
     assert "has no autosave.npz" in nothing.stderr
-    # As if it had been cut off after these frames, of more to come.
+    # This simulates a run that was interrupted after these frames.
     drive_until(kitti_tree, folder, 11)
     write_options(folder, read_options(folder).model_copy(update={"max_frames": None}))
     with lock_run(folder):
@@ -400,7 +396,7 @@ def test_the_command_line_resumes_what_was_interrupted(kitti_tree, tmp_path):
     assert resumed.returncode == 0, resumed.stderr
     assert "continuing at frame 12 ..." in resumed.stderr
     assert f"runs/{folder.name}" in resumed.stdout
-    assert "runs/latest" not in resumed.stdout  # which is another run after the next one
+    assert "runs/latest" not in resumed.stdout  # after the next run, this is a different run
     assert elsewhere.read_text() == "kept"
     assert (tmp_path / "town.npz").read_bytes() == (folder / "map.npz").read_bytes()
     assert not (folder / LOCK).exists()

@@ -1,7 +1,4 @@
-"""Sources that cannot be read are rejected with one sentence.
-
-A source that ends early keeps its frames.
-"""
+"""Sources that cannot be read are rejected with one sentence. A source that ends early is read."""
 
 from __future__ import annotations
 

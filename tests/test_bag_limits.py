@@ -1,7 +1,4 @@
-"""Compressed bags are read like other bags.
-
-They are rejected if they decompress to too much data.
-"""
+"""Compressed bags are read, unless they decompress to too much data."""
 
 from __future__ import annotations
 
@@ -54,7 +51,6 @@ def test_compressed_bags_are_read(tmp_path: Path, kind: str, compression: str):
 
 @pytest.mark.parametrize(("kind", "compression"), KINDS)
 def test_what_unpacks_to_too_much_is_refused(tmp_path, monkeypatch, kind: str, compression: str):
-    """Images of one colour have 3 MB in a file of a few kilobytes. The limit is 1 MB."""
     black = [np.zeros((1000, 1000), np.uint8)] * 3
     path = compressed(tmp_path, kind, compression, {LEFT: black, RIGHT: black})
     assert sum(p.stat().st_size for p in tmp_path.rglob("*") if p.is_file()) < 100_000

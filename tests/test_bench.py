@@ -1,4 +1,4 @@
-"""The grid of a benchmark: its cells, their results, and that no cell is lost."""
+"""The grid of a benchmark, its cells and their results. No cell is lost."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_cell_is_finished_only_by_a_whole_run_of_the_same_settings(run_folder:
     ("sensor", "asked", "finished"),
     [
         ("rgbd", None, True),
-        ("mono", None, True),  # of a reader of another package: the data has one camera
+        ("mono", None, True),  # a reader of a plug-in, whose data has one camera
         ("mono", "mono", True),
         ("stereo", "mono", False),
         ("mono", "stereo", False),
@@ -287,15 +287,12 @@ def test_the_table_stays_only_if_cells_are_missing_or_failed(
         assert ("a line for logs" in text) is not color
         last = text.rpartition("1 of 2 runs" if stays else "1 of 1 run")[2]
         assert (f"of {len(cells)} run{'s' * stays} finished" in text) is (stays or color)
-        assert ("\x1b[2K" in last) is (color and not stays)  # erased again
+        assert ("\x1b[2K" in last) is (color and not stays)  # the table is erased
 
 
 @pytest.fixture
 def bench(stub: Path, kitti_tree: Path, tmp_path: Path, monkeypatch, capsys):
-    """Run ``vslam bench`` with a stub in place of runs.
-
-    Returns the exit code, stdout and stderr.
-    """
+    """Run ``vslam bench`` with a stub in place of runs. Return the exit code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         execute, "RunOptions", functools.partial(execute.RunOptions, command=COMMAND)
@@ -344,7 +341,7 @@ def test_bench_shows_the_detectors_beside_the_first_one(bench):
     assert "Side by side: bow / none / both" in out
     rows = [line.split() for line in out.splitlines() if line.startswith("00 ")]
     assert [row[:2] for row in rows] == [["00", "none"], ["00", "brightness:1"]] * 2
-    assert [len(row) for row in rows] == [11, 11, 8, 8]  # lost, ATE, RPE; rotation, loops: of three
+    assert [len(row) for row in rows] == [11, 11, 8, 8]  # numbers of cells in both tables
     assert re.search(r"- Lost frames: bow \d+ in 3 runs, none \d+ in 3 runs, both \d+ in 3 ", out)
     assert "ATE over all conditions, both against bow: no winner. Of 1 sequence, " in out
     assert "both against bow" in Path("bench/report.md").read_text()
@@ -414,11 +411,11 @@ def test_bench_loses_nothing_to_an_interrupt(bench, stub: Path, monkeypatch):
     assert code == 1
     assert "stopped: 2 of 6 runs finished" in out
     kept = {path.name for path in Path("bench").glob("kitti-*")}
-    assert len(kept) >= 3  # the one at hand, too
+    assert len(kept) >= 3  # including the run that was being written
     monkeypatch.setattr(table.GridProgress, "add", add)
     assert bench()[0] == 0
     done = started(stub)
-    assert len(done) <= 7  # the one that was running is done again
+    assert len(done) <= 7  # the interrupted run is repeated
     assert len(set(done)) == 6
     assert not Path("bench/.parts").exists()
 
@@ -442,10 +439,7 @@ def test_bench_refuses_before_it_starts(bench, words, parts):
 
 @pytest.mark.slow
 def test_a_real_grid_killed_and_resumed(kitti_tree: Path, tmp_path: Path):
-    """The benchmark is killed by SIGKILL in its second cell.
-
-    The process of this cell also ends. The next start runs only this cell.
-    """
+    """The benchmark is killed by SIGKILL during its second cell, whose process also ends."""
     out = tmp_path / "bench"
     command = [sys.executable, "-m", "vslam", "bench", "--data", str(kitti_tree), "--seqs", "00"]
     command += ["--max-frames", "6", "--perturb", "none,brightness", "--detectors", "none"]
@@ -496,7 +490,6 @@ def test_a_run_ends_by_itself_though_its_standard_input_is_open():
 
 @pytest.mark.slow
 def test_a_video_is_a_grid_of_one_sequence(corridor, tmp_path: Path, monkeypatch):
-    """The video is run once. When the same command is called again, the run is already finished."""
     pairs = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)][:5]
     video = write_video(tmp_path / "drive.mkv", pairs)
     calib = write_calibration(tmp_path / "stereo.yaml", corridor.camera)

@@ -43,10 +43,7 @@ def random_system(n: int, pairs: list[tuple[int, int]], seed: int = 0) -> np.nda
 
 
 def in_panels(structure: Structure, dense: np.ndarray) -> np.ndarray:
-    """Convert the lower triangle of a dense matrix to the input of ``factor_solve``.
-
-    The matrix is in the order of the caller.
-    """
+    """Convert the lower triangle of a dense matrix, in the caller's order, to panels."""
     S = np.zeros(36 * len(structure.row))
     for c in range(len(structure.order)):
         begin, width = panel(structure, c)
@@ -66,7 +63,7 @@ def test_solution_is_numpys(name):
     b = np.random.default_rng(1).normal(size=(n, 6))
     x = b[structure.order]
     S = in_panels(structure, dense)
-    # Every block of the matrix is in the structure: nothing was lost on the way.
+    # Every block of the matrix is in the structure.
     assert np.abs(S).sum() == pytest.approx(np.abs(np.tril(dense)).sum())
     assert factor_solve(structure, S, x)
     expected = np.linalg.solve(dense, b.ravel()).reshape(n, 6)
@@ -75,10 +72,7 @@ def test_solution_is_numpys(name):
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_structure_is_that_of_elimination(name):
-    """The structure of each column is compared with that of a slow elimination.
-
-    The slow elimination keeps the neighbours of each block in sets.
-    """
+    """The reference is a slow elimination that keeps the neighbours of each block in sets."""
     n, pairs = SYSTEMS[name]
     structure = analyse(n, np.array(pairs).reshape(-1, 2))
     assert sorted(structure.order.tolist()) == list(range(n))
@@ -112,10 +106,7 @@ def test_arrows_and_chains_do_not_fill():
 
 
 def test_a_long_chain_with_loops_stays_sparse():
-    """Each of a thousand keyframes is coupled to ten before it and ten after it.
-
-    Two places are visited twice.
-    """
+    """Each of a thousand keyframes is coupled to twenty others. Two places are revisited."""
     pairs = chain(1000, 10)
     pairs += [(a + s, b + s + t) for a, b in ((0, 700), (300, 850)) for s in range(100)
               for t in range(-5, 5)]  # fmt: skip

@@ -35,13 +35,10 @@ def features_of(descriptors: np.ndarray) -> Features:
 
 @pytest.fixture(scope="module")
 def tree() -> Vocabulary:
-    """Make a vocabulary of 20 x 20 words with equal weights.
-
-    Word w has the descriptor of node 21 + w.
-    """
+    """Make a vocabulary of 20 x 20 words with equal weights. Word w is node 21 + w."""
     rng = np.random.default_rng(0)
     nodes = rng.integers(0, 256, (21 + WORDS, 32), dtype=np.uint8)
-    for word in range(WORDS):  # near its parent, or else a descent would not find it
+    for word in range(WORDS):  # near its parent, so that the descent finds it
         nodes[21 + word] = nodes[1 + word // 20]
         nodes[21 + word, :4] = rng.integers(0, 256, 4)
     n_children = np.array([20] * 21 + [0] * WORDS, np.uint8)
@@ -49,7 +46,6 @@ def tree() -> Vocabulary:
 
 
 def image_of(tree: Vocabulary, words: list[int] | np.ndarray) -> Features:
-    """Make an image that contains exactly these words."""
     return features_of(tree.descriptors[21 + np.asarray(words, np.int64)].view(np.uint8))
 
 
@@ -93,7 +89,7 @@ def test_the_inverted_index_scores_like_the_bags_one_by_one():
     tree = train(images, 5, 3)
     bags = [bow_vector(tree, tree.words(image)) for image in images]
     index = InvertedIndex(tree.n_words)
-    # Enough for words to move several times; some ids are left out.
+    # There are enough images for words to move several times. Some ids are left out.
     ids = np.flatnonzero(np.arange(120) % 4 != 3)
     for k, bag in zip(ids, bags, strict=True):
         index.add(int(k), bag)
@@ -141,14 +137,14 @@ def test_the_revisited_place_is_found_and_neighbours_are_not(tree):
 def test_a_candidate_must_be_as_like_as_the_neighbours_of_the_query(tree):
     world = World(tree)
     first = world.add(PLACE[:24])  # 24 of 40 shared: 0.6
-    world.add(np.r_[PLACE[:32], 300:308], sees=range(15))  # 0.8: the bar
+    world.add(np.r_[PLACE[:32], 300:308], sees=range(15))  # 0.8 is the threshold
     query = world.add(PLACE, sees=range(15))
     assert world.query(query) == []
     lower = World(tree)
     assert lower.add(PLACE[:24]) == first
     lower.add(np.r_[PLACE[:20], 300:320], sees=range(15))  # 0.5
     assert lower.query(lower.add(PLACE, sees=range(15))) == [first]
-    # One landmark fewer, and it is no neighbour: it sets no bar.
+    # With one landmark fewer, it is no neighbour, so that it sets no threshold.
     loose = World(tree)
     assert loose.add(PLACE[:32]) == first
     loose.add(np.r_[PLACE[:36], 300:304], sees=range(14))
@@ -183,9 +179,9 @@ def test_a_group_counts_together_and_its_best_keyframe_stands_for_it(tree):
         world.add(np.r_[PLACE[:n], 300 : 300 + 40 - n], sees=range(100, 120)) for n in (34, 36, 35)
     ]
     query = world.add(PLACE)
-    # The first alone is the likest; the group has nearly three times its score.
+    # The first image has the highest score, but the group has nearly three times this score.
     assert world.query(query) == [group[1]]
-    # As soon as groups are not formed, it is the other way round.
+    # Without groups, the order is reversed.
     alone = World(tree, group_size=0)
     alone.add(PLACE[:38])
     for n in (34, 36, 35):
@@ -240,11 +236,10 @@ def test_features_are_grouped_by_node(tree):
 
 
 def match_in_plain_python(a, b, node_a, node_b, max_distance, ratio):
-    """Match features in plain Python.
+    """Match each feature of a to the closest feature of b under the same node.
 
-    Each feature of a is matched to the closest feature of b under the same node. Then, each feature
-    of b keeps only the closest feature of a. If several are equally close, the one with the first
-    node is kept.
+    Then, each feature of b keeps only the closest feature of a. If several are equally close, the
+    one with the first node is kept.
     """
     bits_a, bits_b = (np.unpackbits(x.view(np.uint8), axis=1) for x in (a, b))
     table = (bits_a[:, None] != bits_b[None]).sum(axis=2)

@@ -1,4 +1,4 @@
-"""Bundle adjustment, compared with GTSAM on the same problem, and its difficult cases."""
+"""Bundle adjustment is compared with GTSAM on the same problem, and tested in difficult cases."""
 
 from __future__ import annotations
 
@@ -21,10 +21,7 @@ N_FREE, N_FIXED = 4, 2
 def make_problem(
     *, noise: float = 0.0, outliers: int = 0, n_points: int = 150, seed: int = 0
 ) -> tuple[BundleProblem, np.ndarray, np.ndarray]:
-    """Make a perturbed problem with monocular and stereo observations.
-
-    Also return the true poses and points.
-    """
+    """Make a perturbed problem with monocular and stereo observations, and its solution."""
     rng = np.random.default_rng(seed)
     n_cameras = N_FREE + N_FIXED
     truth = np.array(
@@ -70,7 +67,6 @@ def landmark_of_observation(problem: BundleProblem) -> np.ndarray:
 
 
 def robust_cost(problem: BundleProblem, T_cw: np.ndarray, points: np.ndarray) -> float:
-    """Compute half the sum of the Huber losses using NumPy."""
     p = landmark_of_observation(problem)
     T = T_cw[problem.camera]
     in_camera = np.einsum("oij,oj->oi", T[:, :3, :3], points[p]) + T[:, :3, 3]
@@ -83,10 +79,7 @@ def robust_cost(problem: BundleProblem, T_cw: np.ndarray, points: np.ndarray) ->
 
 
 def gtsam_graph(problem: BundleProblem):
-    """Make the same problem as a factor graph of GTSAM.
-
-    The variables are the cameras 0 to K - 1, followed by the points.
-    """
+    """Make the same problem as a factor graph of GTSAM, with the K cameras before the points."""
     mono = gtsam.Cal3_S2(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy)
     stereo = gtsam.Cal3_S2Stereo(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy, CAMERA.baseline)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -151,7 +144,7 @@ def test_same_optimum_as_gtsam_with_outliers():
     theirs = np.linalg.inv([result.atPose3(k).matrix() for k in range(n)])
     points = np.array([result.atPoint3(n + i) for i in range(len(problem.points))])
     assert ours.cost == pytest.approx(graph.error(result), rel=1e-6)
-    # Nearly all of the cost is that of the outliers, at the truth, too.
+    # Even at the true values, nearly all of the cost comes from the outliers.
     assert ours.cost < robust_cost(problem, truth, true_points) < 0.6 * graph.error(values)
     assert pose_differences(ours.T_cw, theirs).max() < 1e-5
     assert np.median(np.linalg.norm(ours.points - points, axis=1)) < 1e-4
@@ -249,10 +242,6 @@ def test_a_point_seen_once_in_mono_does_not_spoil_the_rest():
 
 
 def test_without_fixed_cameras_the_free_ones_settle_near_the_start():
-    """Motion in six directions does not change the cost.
-
-    Damping keeps the cameras near the start.
-    """
     problem, _, _ = make_problem()
     camera = problem.camera
     keep = camera < N_FREE
@@ -297,7 +286,7 @@ def test_cholesky_solve_agrees_with_numpy(n):
 
 
 def test_cholesky_solve_of_a_banded_system():
-    """The solver skips blocks without coupling, which it finds by a test for zero."""
+    """The solver tests for blocks of zeros, and skips them."""
     rng = np.random.default_rng(0)
     S = np.zeros((60, 60))
     for k in range(0, 54, 6):

@@ -44,10 +44,7 @@ T_LEFT_RIGHT[:3, 3] = 0.06, 0.001, -0.002
 
 
 def poses(board: Board, model: CameraModel, n: int) -> list[np.ndarray]:
-    """Return ``T_camera_board`` of several views.
-
-    The board is in all parts of the image and is tilted in all directions.
-    """
+    """Return ``T_camera_board`` of views in all parts of the image, tilted in all directions."""
     points = board_points(board)
     middle, extent = points.mean(axis=0), float(np.ptp(points, axis=0).max())
     upright = np.diag([1.0, -1.0, -1.0]) if board.kind == "aprilgrid" else np.eye(3)
@@ -58,7 +55,7 @@ def poses(board: Board, model: CameraModel, n: int) -> list[np.ndarray]:
         ray = unproject(model, xy)[0]
         angle = 2.4 * k  # the golden angle
         tilt = cv2.Rodrigues(0.55 * np.array([np.cos(angle), np.sin(angle), 0.2]))[0]
-        # Turned towards the camera, a board off the axis is seen whole.
+        # A board off the axis is rotated towards the camera, so that all of it is visible.
         R = cv2.Rodrigues(np.cross([0, 0, 1], ray))[0] @ tilt @ upright
         T = np.eye(4)
         reach = (1.15 + 0.1 * (k % 2)) * model.fx * extent / (0.6 * model.width)
@@ -73,7 +70,6 @@ def rendered(board: Board, model: CameraModel, views: list[np.ndarray], seed: in
 
 
 def exact_views(board: Board, model: CameraModel, poses: list[np.ndarray]) -> list[View]:
-    """Make views from projected corners with a little noise, without images."""
     rng, points = np.random.default_rng(0), board_points(board)
     found = []
     for k, T in enumerate(poses):
@@ -84,7 +80,7 @@ def exact_views(board: Board, model: CameraModel, poses: list[np.ndarray]) -> li
 
 @pytest.fixture
 def calibrate(call):
-    """Run ``vslam calibrate`` in an empty folder. Returns the exit code, stdout and stderr."""
+    """Run ``vslam calibrate`` in an empty folder. Return the exit code, stdout and stderr."""
     return partial(call, "calibrate")
 
 
@@ -110,7 +106,7 @@ def test_checkerboard_filmed_by_one_camera(calibrate, tmp_path):
     write_images(tmp_path, {"board": images}, [f"{k}.png" for k in range(14)])
     code, out, _ = calibrate("board", "--board", "checkerboard", "--size", "9x6")
     assert code == 0, out
-    # One is cut off by the border of the image.
+    # One board is cut off by the border of the image.
     assert out.startswith("The checkerboard of 9x6 inner corners is seen in 13 of 14 images.\n")
     assert "vslam run DRIVE --sensor mono --calib calibration.yaml" in out
     check_camera(read_calibration(["calibration.yaml"]).left, PINHOLE)

@@ -1,4 +1,4 @@
-"""Camera models, compared with OpenCV's, and images that are rectified with them."""
+"""Camera models are compared with those of OpenCV. Images are rectified with them."""
 
 from __future__ import annotations
 
@@ -95,10 +95,6 @@ RIGS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("rig", RIGS)
 def test_rectified_rows_correspond_and_disparity_is_depth(rig):
-    """A point has the same row in both rectified images.
-
-    Its disparity is that of the rectified camera.
-    """
     calibration = RIGS[rig]
     found = rectify(calibration)
     camera = found.camera
@@ -135,7 +131,6 @@ def test_no_pixel_of_a_rectified_image_is_black(rig):
 
 
 def test_most_of_the_view_is_kept():
-    """At least two sides of the rectified image show the border of the original image."""
     found = rectify(Calibration(replace(PINHOLE, distortion=RADTAN[:4])))
     c = found.camera
     ramp = np.tile(np.arange(480)[:, None] * 0.5, (1, 752)).astype(np.uint8)
@@ -204,7 +199,6 @@ def test_a_wide_lens_may_fold_its_corners():
 
 
 def drawn(corridor: StereoSequence, right: list) -> RawSource:
-    """Make a raw source from images in memory."""
     stored = stored_frames(corridor.timestamps, lambda k, image_map: (corridor.left[k], right[k]))
     n_sides = 1 if right[0] is None else 2
     size = corridor.camera.width, corridor.camera.height

@@ -136,7 +136,6 @@ def ros_message(folder: Path, models: Models) -> list[Path]:
 
 
 def opencv(folder: Path, models: Models) -> list[Path]:
-    """Write a calibration using OpenCV, as its stereo sample does."""
     paths = [folder / "intrinsics.yml", folder / "extrinsics.yml"]
     first, second = (cv2.FileStorage(str(p), cv2.FILE_STORAGE_WRITE) for p in paths)
     for k, c in enumerate(models, start=1):
@@ -210,10 +209,7 @@ def complaint(given: list[Path]) -> str:
 
 @pytest.mark.parametrize("write", RADIAL, ids=lambda f: f.__name__)
 def test_truncated_and_damaged_files(tmp_path, write):
-    """The reader raises an `InputError` of one line.
-
-    If it accepts the file, all numbers are possible for a camera.
-    """
+    """If the reader accepts a damaged file, all numbers are possible for a camera."""
     given = write(tmp_path, (LEFT, RIGHT))
     files = [p for p in tmp_path.rglob("*") if p.is_file()]
     whole = {path: path.read_text() for path in files}
@@ -294,10 +290,7 @@ def test_a_size_that_neither_file_nor_image_tells(tmp_path):
 
 
 def test_settings_of_an_rgbd_camera(tmp_path):
-    """The file is like ORB-SLAM2's TUM1.yaml.
-
-    It states neither the image size nor the camera type.
-    """
+    """Like ORB-SLAM2's TUM1.yaml, the file states neither the image size nor the camera type."""
     path = tmp_path / "TUM1.yaml"
     path.write_text(
         "%YAML:1.0\nCamera.fx: 517.306408\nCamera.fy: 516.469215\nCamera.cx: 318.643040\n"

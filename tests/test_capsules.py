@@ -75,7 +75,6 @@ def test_routing_turns_to_the_majority():
 
 
 def routed(u, W, iterations, over="primary", alive=None):
-    """Return the output capsules and the coupling coefficients."""
     v, e, total = capsules.route(u, W, iterations, over, alive)
     return v, capsules.couplings(e, total)
 
@@ -179,15 +178,12 @@ def test_gain_and_bias_of_the_camera_drop_out():
 
 
 def test_what_shows_no_texture_changes_nothing_else():
-    """An object without texture hides a part of the image.
-
-    Neither the object nor its brightness changes the output for the rest of the image.
-    """
+    """An object without texture hides a part of the image."""
     x = images(1)[:, :1]
     dark, bright = x.clone(), x.clone()
     dark[..., 40:], bright[..., 40:] = 0.0, 1.0
     assert textured(dark)[..., 40:].sum() == 0
-    seen = slice(0, 39)  # the last column before it differs from what covers
+    seen = slice(0, 39)  # columns that the object does not touch
     standard = [standardised(image)[..., seen] for image in (dark, bright)]
     assert torch.allclose(*standard, atol=0.05)
     blank = standardised(torch.full((1, 1, 64, 64), 0.7))
@@ -200,7 +196,7 @@ def test_texture_is_more_than_a_grey_level():
     assert textured(x).sum() == 0
     x[..., 1, 2] = 3.0 / 255
     at = textured(x)[0, 0].nonzero().tolist()
-    assert at == [[0, 2], [1, 1], [1, 2]]  # what differs from the pixel on its right or below
+    assert at == [[0, 2], [1, 1], [1, 2]]  # pixels that differ from the one on the right or below
 
 
 @pytest.mark.slow

@@ -285,7 +285,6 @@ def test_thresholds_are_given_as_values_too(call, tmp_path):
 
 
 def commands(group: Any, words: str = "vslam") -> Iterator[tuple[str, Any]]:
-    """Return every visible command with the words that call it."""
     for name, found in group.commands.items():
         if hasattr(found, "commands"):
             yield from commands(found, f"{words} {name}")
@@ -365,7 +364,7 @@ def test_the_choices_of_presets_are_those_of_the_settings():
     ],
 )
 def test_run_refuses_bad_input(call, root, words, parts, monkeypatch):
-    monkeypatch.setattr("vslam.run.warmup.is_cold", lambda: False)  # it would say so first
+    monkeypatch.setattr("vslam.run.warmup.is_cold", lambda: False)  # prints no message
     refused(call("run", "--data", root, *words.split()), *parts)
     assert not Path("runs").exists()
 
@@ -406,16 +405,13 @@ def fake_result(index: int, T_wc: np.ndarray) -> TrackResult:
 
 @pytest.fixture
 def pipeline(monkeypatch) -> SimpleNamespace:
-    """A replacement of SLAM that returns a shifted ground truth.
-
-    It records the arguments of its calls.
-    """
+    """A replacement of SLAM that returns a shifted ground truth and records its arguments."""
     calls = SimpleNamespace(interrupted=None, loops=[], lost=False)
 
     def run_sequence(
         sequence, perturbation, settings, recorder, on_frame, autosave=None, resume=None, slam=None
     ):
-        T_wc = circle(len(sequence))  # the ground truth, if it has one
+        T_wc = circle(len(sequence))  # the ground truth, if there is one
         T_wc[:, 1, 3] += 2.0
         tracks = [fake_result(k, T_wc[k]) for k in range(len(sequence))]
         if calls.lost:
@@ -504,7 +500,7 @@ def test_a_map_is_continued_with_its_own_thresholds_by_default(call, root, pipel
         assert pipeline.settings.thresholds.orb.n_features == n
 
 
-CLOSED = LoopEdge(3, 0, 0.6, True, "closed", 80, 60)  # no pose: neither right nor wrong
+CLOSED = LoopEdge(3, 0, 0.6, True, "closed", 80, 60)  # no pose, so it is not judged
 REJECTED = LoopEdge(2, 0, 0.2, False, "too few matches")
 
 
@@ -599,7 +595,7 @@ def test_a_monocular_run_says_that_its_scale_is_arbitrary(call, root, pipeline):
 
 def test_quiet_run_says_nothing(call, root, pipeline):
     assert call("run", "--data", root, "--max-frames", 10, "--no-record", "--quiet") == (0, "", "")
-    assert isinstance(pipeline.recorder, MomentRecorder)  # for the page; a file would be a string
+    assert isinstance(pipeline.recorder, MomentRecorder)  # not a file
 
 
 def test_a_run_without_recording_and_report_keeps_no_images(call, root, pipeline):
@@ -668,7 +664,7 @@ def test_eval_of_two_formats_names_no_evo_command(call, tmp_path):
     code, out, err = call("eval", "estimate.tum", "--gt", "gt.txt", "--times", "times.txt")
     assert code == 0, err
     assert "50 of 50 have a ground truth" in out
-    assert "evo_ape" not in out  # evo compares files of one format only
+    assert "evo_ape" not in out  # evo only compares files of the same format
 
 
 @pytest.mark.parametrize("sensor", ["stereo", "mono"])

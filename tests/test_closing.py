@@ -42,8 +42,8 @@ class Deceived(Oracle):
 class Sticker(Ring):
     """A drive in which the camera is carried from one place to another.
 
-    The first image after that shows a few things that look like things that the camera saw before.
-    It also shows what is really there.
+    The first image after that shows a few things that the camera saw before, and what is really
+    there.
     """
 
     def see(self, k, seed):
@@ -63,14 +63,14 @@ CARRIED = [*ROUND[:60], *ROUND[90:]]
 
 
 def run(ring, frames, detector="none", *, threads=1, dark=(), finish=True, config=None, look=None):
-    """Drive along ``frames`` of the ring at ten frames per second.
+    """Run vslam along ``frames`` of the ring, with ten frames per second.
 
     Frames in ``dark`` show nothing. ``look`` is called after each frame.
     """
     slam = Slam(CAMERA, config, detector, threads=threads)
     results = []
     for i, k in enumerate(frames):
-        image = np.array([[i & 255, i >> 8]], np.uint8)  # tells the oracle which frame it is
+        image = np.array([[i & 255, i >> 8]], np.uint8)  # index for the oracle
         features = Features.none() if i in dark else ring.see(k, 1)
         results.append(slam.step_features(Extracted(features), 0.1 * i, image))
         if look is not None:
@@ -101,7 +101,7 @@ def test_a_closed_loop_takes_the_drift_out(check_map):
     slam = closed()
     before, after = errors(without, DRIFTING, ROUND), errors(slam, DRIFTING, ROUND)
     assert before[-1] > 3.0
-    assert after[-1] < 1.2  # the ring is 1.5 % too large: 0.75 m of its radius
+    assert after[-1] < 1.2  # the ring is 1.5 % too large, which is 0.75 m of its radius
     assert np.sqrt((after**2).mean()) < 0.5 * np.sqrt((before**2).mean())
     accepted = [edge for edge in slam.loops if edge.accepted]
     assert [edge.reason for edge in accepted] == ["closed"] * len(slam.corrections)
@@ -128,7 +128,7 @@ def test_a_checkpoint_waits_until_a_loop_that_was_found_is_closed():
 
     run(DRIFTING, ROUND, Oracle(DRIFTING, ROUND), look=look)
     first = next(k for k, (closed_loops, _, _) in enumerate(states) if closed_loops)
-    assert states[first - 1] == (0, True, False)  # found, and not closed yet
+    assert states[first - 1] == (0, True, False)  # the loop is found, but not closed yet
 
 
 ZOOMING = Ring.create(focal_error=0.015, zoom=True)
@@ -185,10 +185,10 @@ def test_same_bytes_with_one_thread_and_two():
 
 @pytest.mark.slow
 def test_two_slams_may_share_the_features_of_their_frames():
-    """Two ``Slam`` objects share features, as those of compared detectors do.
+    """Detectors that are compared share features, and only one of them closes the loop here.
 
-    Only one of them closes the loop. Neither of them changes the shared features, although both
-    corrections of features are active: that of disparities, and that of a delay of the right image.
+    Both corrections of features are active: that of disparities, and that of a delay of the right
+    image. Neither may change the shared features.
     """
     late = 0.004
     ring = replace(Ring.create(focal_error=0.015), right_delay=late)
@@ -252,13 +252,13 @@ def test_a_camera_carried_back_is_lost_without_a_detector():
 @pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 def test_parts_of_the_map_are_joined_by_a_loop(check_map, threads):
-    frames = [*ROUND[:80], *ROUND[140:]]  # 60 frames, 90 m, cut out
+    frames = [*ROUND[:80], *ROUND[140:]]  # 60 frames (90 m) are left out
     slam, results = run(EXACT, frames, Oracle(EXACT, frames), threads=threads)
     assert len(slam.map.restarts) == 1
     assert slam.corrections
     tracked = [r.index for r in results if r.state is not TrackingState.LOST]
     found = errors(slam, EXACT, frames)
-    assert found[tracked].max() < 0.7  # the part after the cut lay some 70 m off
+    assert found[tracked].max() < 0.7  # the error of the part after the gap was about 70 m
     assert len(slam.trajectory()) == len(frames)
     check_map(slam.map)
 
@@ -272,7 +272,7 @@ def test_two_seconds_of_darkness_lose_no_pose(check_map):
     assert set(range(60, 80)) <= set(lost)
     assert len(lost) <= 22
     found = errors(slam, EXACT, ROUND)
-    assert found.max() < 1.5  # the dark frames too: their motion is interpolated
+    assert found.max() < 1.5  # including the dark frames, whose motion is interpolated
     check_map(slam.map)
 
 
@@ -296,11 +296,8 @@ def closing_of(edge, config, threads=1):
 
 @cache
 def open_loop(gap):
-    """Make a map of two sub-maps.
-
-    Also return a verified loop between the sub-maps that is not closed yet.
-    """
-    if gap == "dark":  # the camera went on for a second
+    """Make a map of two sub-maps, and a verified loop between them that is not closed yet."""
+    if gap == "dark":  # the camera moved on for a second
         ring, frames, dark = DRIFTING, ROUND, range(60, 70)
     else:  # 90 m between two frames
         ring, frames, dark = EXACT, [*ROUND[:80], *ROUND[140:]], ()
@@ -313,7 +310,7 @@ def open_loop(gap):
     return slam.map, edge
 
 
-# Where no speed was known there is no GAP edge. Such a sub-map may lie too far off for the
+# If no speed was known, there is no GAP edge. Such a sub-map may be too far away for the
 # optimiser to follow the loop, unless it is first moved as a whole.
 STIFF = Config(pose_graph=PoseGraphConfig(weak_translation=10.0))
 
@@ -387,7 +384,7 @@ def test_a_global_adjustment_that_fails_leaves_the_map_as_it_was(monkeypatch, ca
     (record,) = caplog.records
     assert record.levelname == "WARNING"
     assert "not positive definite" in record.getMessage()
-    # The next loop is closed, and its adjustment merged.
+    # The next loop is closed, and the result of its adjustment is merged.
     closing.consider(map_, edge.query, candidates)
     assert len(closing.corrections) == 2
     before = map_.copy().arrays
@@ -397,7 +394,6 @@ def test_a_global_adjustment_that_fails_leaves_the_map_as_it_was(monkeypatch, ca
 
 
 def test_loop_closing_restored_from_its_state_closes_the_loop_that_waits():
-    """A loop that was verified from only one keyframe waits for the next keyframe."""
     ring, frames = EXACT, [*ROUND[:80], *ROUND[140:]]
     map_ = copy.deepcopy(open_loop("carried")[0])
     oracle, last = Oracle(ring, frames), map_.n_keyframes - 1
@@ -421,10 +417,7 @@ def test_loop_closing_restored_from_its_state_closes_the_loop_that_waits():
 
 
 def test_where_no_speed_was_known_a_restart_is_unpredicted():
-    """Tracking is lost at once.
-
-    The map has no velocity from which the motion during the gap can be predicted.
-    """
+    """Tracking is lost at once, so that the map has no velocity."""
     frames = [0.0, *ROUND[30:60]]
     slam, results = run(EXACT, frames)
     assert [r.state for r in results[:3]].count(TrackingState.LOST) == 1
@@ -455,7 +448,6 @@ def test_a_wrong_keyframe_bends_the_map_and_the_loops_that_tell_are_refused():
 
 
 def twofold() -> Ring:
-    """Make a ring whose second half looks exactly like its first half."""
     first = EXACT.points[:, 2] > 0.0
     points, descriptors = EXACT.points[first], EXACT.descriptors[first]
     return Ring(np.concatenate([points, points * [-1, 1, -1]]), np.tile(descriptors, (2, 1)))

@@ -1,4 +1,4 @@
-"""The grid on a local Dask cluster: one worker is killed, and no cell is lost."""
+"""A benchmark on a local Dask cluster loses no cell if a worker is killed."""
 
 from __future__ import annotations
 
@@ -112,10 +112,6 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
     [("foo://bar", "no scheduler answers"), ("tls://127.0.0.1:9", "Dask has no certificates")],
 )
 def test_an_address_that_cannot_be_used_leaves_no_client_behind(address: str, said: str):
-    """A client that never connected cannot be closed.
-
-    Closing it once took 20 s and ended in a traceback.
-    """
     code = (
         "from vslam.lab.bench.cluster import run_on_cluster\n"
         "from vslam.lab.bench.execute import RunOptions\n"

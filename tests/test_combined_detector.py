@@ -15,8 +15,6 @@ from vslam.loops import LoopCandidate
 
 
 class Told:
-    """A detector that returns the candidates that it was given."""
-
     def __init__(self, name: str, matches: list[int], *, similarity: float | None) -> None:
         self.name, self.added = name, []
         self._found = [LoopCandidate(9, m, 1.0 / (1 + m), similarity, name) for m in matches]

@@ -1,4 +1,4 @@
-"""When candidates are consistent over several keyframes, and when verified loops agree."""
+"""Candidates are consistent over several keyframes, and verified loops agree."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from vslam.geometry import compose, inverse, se3_exp, se3_log
 from vslam.loopclosure.consistency import LoopConsistency, implied_drift
 from vslam.loops import LoopCandidate, LoopEdge
 
-STRICT = ConsistencyConfig(min_keyframes=3, max_gap=0)  # ORB-SLAM's rule
+STRICT = ConsistencyConfig(min_keyframes=3, max_gap=0)  # the rule of ORB-SLAM
 DRIFT = se3_exp(np.array([2.0, 0.3, -4.0, 0.01, 0.12, 0.0]))
 
 
 class Street:
     """A map that has only what the check of consistency needs.
 
-    Its keyframes are 2 m apart on a street that is driven twice. Keyframes up to 6 m apart are
+    Its keyframes are 2 m apart on a street that is passed twice. Keyframes up to 6 m apart are
     covisible. The second pass starts with keyframe 100 and has drifted.
     """
 
@@ -38,10 +38,7 @@ def candidates(query: int, *matches: int) -> list[LoopCandidate]:
 
 
 def verified(query: int, match: int, error=(0.0, 0.0, 0.0), turn: float = 0.0) -> LoopEdge:
-    """Make an edge with the true relative pose and an error.
-
-    The error consists of ``error`` metres and ``turn`` degrees.
-    """
+    """Make an edge whose pose is wrong by ``error`` metres and ``turn`` degrees."""
     true = compose(
         inverse(se3_exp(np.array([0.0, 0.0, 2.0 * (query - 100), 0.0, 0.0, 0.0]))),
         inverse(STREET.keyframe_pose(match)),
@@ -98,13 +95,13 @@ def test_only_the_consistent_one_of_several_candidates_passes():
 
 
 def test_overlapping_groups_do_not_multiply():
-    # Each of ten candidates overlaps all the groups before: pairs of them would be 10^30.
+    # Each of ten candidates overlaps all earlier groups. There would be 10^30 pairs.
     consistency = LoopConsistency(ConsistencyConfig(min_keyframes=3, max_gap=2))
     for query in range(110, 140):
         matches = [20 + (query + i) % 10 for i in range(10)]
         consistency.update(query, candidates(query, *matches), STREET)
         assert len(consistency.state().places) <= 10
-    for query in range(140, 170):  # and those that nothing continues are forgotten
+    for query in range(140, 170):  # groups that are not continued are forgotten
         apart = [1000 * query + 20 * i for i in range(10)]
         consistency.update(query, candidates(query, *apart), STREET)
         assert len(consistency.state().places) <= 30
@@ -150,7 +147,7 @@ def test_edges_that_disagree_do_not(wrong):
     consistency.update(111, [], STREET)
     assert not consistency.confirm(verified(111, 11), STREET).accepted
     consistency.update(112, [], STREET)
-    assert consistency.confirm(verified(112, 12), STREET).accepted  # the true ones outlive it
+    assert consistency.confirm(verified(112, 12), STREET).accepted  # the true loops are kept
 
 
 def test_one_keyframe_cannot_confirm_itself():
@@ -185,7 +182,7 @@ def test_a_rejected_edge_stays_rejected_and_counts_for_nothing():
 
 
 def test_a_revisit_of_twenty_metres_is_closed_within_it():
-    # Keyframes every 3 m and a detector that misses every other one.
+    # There is a keyframe every 3 m, and the detector misses every second one.
     consistency = LoopConsistency(ConsistencyConfig())
     closed_at = None
     for turn in range(7):

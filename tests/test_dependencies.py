@@ -1,8 +1,7 @@
 """Which module may import which (docs/explanation/design.md, section 2), read from the source.
 
 Every folder and module has a level. A module may import modules of its own level and of lower
-levels. There are no circular imports. In addition, a few libraries may only be imported in one
-place each.
+levels. There are no circular imports. A few libraries may only be imported in one place each.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ FOLDERS = {
     "loopclosure": "vslam.loopclosure",
     "backend": "vslam.backend",
 }
-# From the ground up; a module belongs to the longest name here that it lies within. What stands
-# together on one level may not import each other, save where SIBLINGS says so.
+# The lowest level comes first. A module belongs to the longest of these names that is a prefix of
+# its name. Names on one level may not import each other, except as listed in SIBLINGS.
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.errors", "vslam.machine", "vslam.method", "vslam.workers"),
     ("vslam.kernels", "vslam.plugins", "vslam.untrusted", "vslam.lock_file"),
@@ -58,15 +57,15 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.cli",),
     ("vslam.__main__", "vslam"),
 )
-# Imports across a level, module by module: the verification of loops matches features and
-# optimises poses as tracking does.
+# Allowed imports within a level, by module. The verification of loops matches features and
+# optimises poses like tracking.
 SIBLINGS = {
     ("vslam.loopclosure.verification", "vslam.frontend.matching"),
     ("vslam.loopclosure.verification", "vslam.frontend.pose"),
     ("vslam.loopclosure.learned_localisation", "vslam.frontend.pnp"),
     ("vslam.loopclosure.learned_localisation", "vslam.frontend.pose"),
 }
-# A benchmark starts the command line in processes of its own: nothing comes back but files.
+# A benchmark starts the command line in separate processes, which only return files.
 STARTED = {
     ("vslam.lab.bench.execute", "vslam.cli.child"),
     ("vslam.cli.cells", "vslam.cli.child"),
@@ -92,12 +91,11 @@ ONLY_IN = {
 }
 
 TRAINING = "vslam.loopclosure.training"
-# Imports torch inside its functions, and only after it has looked for it.
+# Imports torch inside its functions, after it has checked that torch is installed.
 TRAINING_COMMANDS = "vslam.cli.train"
 
 
 def sources() -> dict[str, Path]:
-    """Return the source of every module of the package by its installed name."""
     found = {}
     for folder, package in FOLDERS.items():
         for path in sorted((ROOT / folder).rglob("*.py")):
@@ -111,10 +109,7 @@ def within(module: str, package: str) -> bool:
 
 
 def imports_of(source: str, module: str = "", *, package: bool = False) -> set[str]:
-    """Return the absolute names of all imports in a source.
-
-    Imports in functions and under TYPE_CHECKING are included.
-    """
+    """Return the absolute names of all imports, including those in functions."""
     names = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -133,8 +128,8 @@ def imports_of(source: str, module: str = "", *, package: bool = False) -> set[s
 def modules_of(names: set[str], known: set[str]) -> set[str]:
     """Return the modules among imported names.
 
-    ``from a.b import c`` needs the module a.b. If c is itself a module, a.b is only the package in
-    which c lies, and does not count.
+    ``from a.b import c`` needs the module a.b. If c is itself a module, a.b is only its package and
+    does not count.
     """
     found = names & known
     parents = {
@@ -161,10 +156,7 @@ def level_of(module: str) -> tuple[int, str]:
 
 
 def upward(arrows: dict[str, set[str]]) -> list[str]:
-    """Return the imports that lead to a higher level.
-
-    Imports within a level are also returned if they are not allowed.
-    """
+    """Return the imports that lead to a higher level, or that are not allowed within a level."""
     wrong = []
     for module, targets in arrows.items():
         level, place = level_of(module)
@@ -259,8 +251,7 @@ def test_heavy_libraries_stay_where_they_belong(library):
 def test_only_training_reaches_the_libraries_of_the_extra_train():
     """Chains of imports may have any length.
 
-    Runs, maps, loops and benchmarks do not need the extra. There is one exception: the check of
-    networks that are not shipped needs onnx. If onnx is missing, one sentence says so.
+    There is one exception: the check of networks that are not shipped needs onnx.
     """
     extra = {"torch", "safetensors", "onnx", "onnxscript"}
     need = {m for m, names in IMPORTS.items() if {name.partition(".")[0] for name in names} & extra}
@@ -294,10 +285,6 @@ def names_of(path: Path) -> set[str]:
 
 
 def test_the_tools_import_what_there_is():
-    """No test runs an experiment for hours.
-
-    This test finds imports in the tools that no longer exist.
-    """
     missing = []
     for path in sorted((ROOT / "tools").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -333,10 +320,7 @@ def test_tracking_and_mapping_load_no_heavy_library():
 
 @pytest.mark.slow
 def test_a_run_loads_what_it_needs(kitti_tree, tmp_path):
-    """A third of the start-up time is imports.
-
-    A run without pages, recording or ground truth does not import the modules for them.
-    """
+    """A third of the start-up time is imports."""
     (tmp_path / "sequences").symlink_to(kitti_tree / "sequences")
     script = (
         "import atexit, sys\n"

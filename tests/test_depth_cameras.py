@@ -1,4 +1,4 @@
-"""Depth cameras, which are replaced by small fakes of their packages that play recorded frames."""
+"""Depth cameras, whose packages are replaced with small mocks that play back recorded frames."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Recorded:
     lens: tuple[float, ...] = (0.0,) * 5
     shown: int = 0
     log: list[Any] = field(default_factory=list)
-    gone: type[Exception] | None = None  # raised instead of a time-out after the last frame
+    gone: type[Exception] | None = None  # raised after the last frame, instead of a time-out
 
     def following(self) -> int | None:
         if self.shown == len(self.left):
@@ -46,17 +46,14 @@ class Recorded:
 
 
 def colours(grey: np.ndarray) -> np.ndarray:
-    """Make pixels of different red, green and blue that have this grey value."""
+    """Make ``(H, W, 3)`` RGB pixels of different colours with this grey value."""
     rgb = np.repeat(grey[..., None], 3, axis=2).astype(int)
     rgb[..., 2] = np.clip(rgb[..., 2] + 3, 0, 255)  # blue has a weight of 0.114
     return rgb.astype(np.uint8)
 
 
 def realsense(recorded: Recorded, serials: tuple[str, ...] = ("817", "918")) -> SimpleNamespace:
-    """Replace the part of pyrealsense2 that vslam uses.
-
-    Depth is registered to colour only by ``align``.
-    """
+    """Mock the part of pyrealsense2 that vslam uses. Only ``align`` registers depth to colour."""
     r, c = recorded, recorded.camera
     names = ("color", "depth", "infrared")
     option = SimpleNamespace(emitter_enabled="emitter", stereo_baseline="baseline")
@@ -139,10 +136,7 @@ def realsense(recorded: Recorded, serials: tuple[str, ...] = ("817", "918")) -> 
 
 
 def depthai(recorded: Recorded, platform: str = "RVC2") -> SimpleNamespace:
-    """Replace the part of depthai that vslam uses.
-
-    It is a graph of nodes through which images are passed.
-    """
+    """Mock the part of depthai that vslam uses, which is a graph of nodes."""
     r, c = recorded, recorded.camera
 
     class Frame:
@@ -272,7 +266,7 @@ def depthai(recorded: Recorded, platform: str = "RVC2") -> SimpleNamespace:
 
 
 class QueueGoneError(Exception):
-    """An error that is no RuntimeError, like the error of depthai."""
+    """An error that is not a RuntimeError, like the error of depthai."""
 
 
 FAKES = {"realsense": realsense, "oakd": depthai}
@@ -294,7 +288,7 @@ def taken(source) -> list[Any]:
     """Return the frames of a source until the device stops."""
     frames = []
     with pytest.raises(BrokenSourceError, match="stopped after"):
-        frames.extend(source.frames())  # extend keeps what came before the error
+        frames.extend(source.frames())  # extend keeps the frames before the error
     return frames
 
 
@@ -312,7 +306,7 @@ def test_the_frames_and_the_calibration_are_those_of_the_device(
     assert source.camera.sensor == sensor
     assert (source.camera.fx, source.camera.cx) == (wanted.fx, wanted.cx)
     assert source.camera.baseline == pytest.approx(0.0 if sensor == "mono" else wanted.baseline)
-    first = recorded.shown  # the first image of an OAK camera has told the size
+    first = recorded.shown  # the first image of an OAK camera was used to find the image size
     frames = taken(source)
     assert len(frames) == FRAMES - first
     assert [f.timestamp for f in frames] == pytest.approx(

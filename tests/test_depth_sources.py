@@ -30,7 +30,7 @@ STAMPS = [k * 10**8 for k in range(FRAMES)]
 
 @pytest.fixture(scope="module")
 def depths(corridor: StereoSequence) -> list[np.ndarray]:
-    """Depth in millimetres, which is 0 in the sky."""
+    """Depth in millimetres; 0 in the sky."""
     poses = corridor.T_wc[:FRAMES]
     metres = [corridor_depth(corridor.camera, T_wc) for T_wc in poses]
     return [np.rint(1000 * m).clip(0, 65535).astype(np.uint16) for m in metres]
@@ -43,7 +43,6 @@ def calib(corridor, tmp_path_factory) -> Path:
 
 
 def with_baseline(path: Path, camera: Camera, more: str = "") -> Path:
-    """Write a calibration with the virtual baseline of the camera."""
     path.write_text(f'{path.read_text()[:-1]}, "virtual_baseline": {camera.baseline}{more}}}')
     return path
 
@@ -101,7 +100,7 @@ def test_compressed_inverse_depth(corridor, depths, calib, tmp_path):
     found = first.read(map)[1]
     true = depths[0] / 1000.0
     assert np.array_equal(found > 0, true > 0)
-    # Half a step of 500 / z - 3: an error of z^2 / 1000.
+    # Half a step of 500 / z - 3 is an error of z^2 / 1000.
     assert (abs(found - true) <= 1.01e-3 * true**2 + 1e-6).all()
 
 
@@ -120,15 +119,12 @@ def test_the_camera_info_of_the_images_is_enough(corridor, depths, tmp_path):
 
 
 def test_each_image_gets_the_nearest_depth(corridor, depths, calib, tmp_path):
-    """The times are those of a Kinect.
-
-    Depth arrives at 30 Hz, 18 ms before and 15 ms after the images.
-    """
+    """Like that of a Kinect, depth arrives at 30 Hz, 18 ms before and 15 ms after the images."""
     stamps = [k * 33_000_000 for k in range(FRAMES)]
     sides = {DEPTH: depths, COLOUR: corridor.left[:FRAMES]}
     bag = write_bag(tmp_path / "a.bag", "ros1", sides, stamps, lag=18_000_000)
     frames = list(opened(bag, calib).frames())
-    assert len(frames) == FRAMES - 1  # each takes the depth behind it, so that the last has none
+    assert len(frames) == FRAMES - 1  # the last image has no later depth
     for k, frame in enumerate(frames):
         assert np.array_equal(frame.read(map)[1], depths[k + 1] * np.float32(0.001))
 
@@ -152,7 +148,7 @@ def test_images_of_a_bag_without_depth_are_counted(corridor, depths, calib, tmp_
         "other topics with --topics, or run with --sensor mono."
     )
     assert len(list(source.frames())) == 3
-    assert source.pairing.warnings() == [said]  # of one reading, not of both
+    assert source.pairing.warnings() == [said]  # the warning is about one reading, not about both
     assert opened(bag, calib, sensor="mono").pairing is None
 
 
@@ -186,7 +182,7 @@ def test_topics_of_bags_with_depth(corridor, depths, calib, tmp_path):
 def test_folders_by_option_and_by_times(corridor, depths, calib, folders, tmp_path, caplog):
     times = [1403636579.76 + 0.1 * k for k in range(3)]
     write_images(tmp_path, {"a": corridor.left[:3]}, [f"{t:.6f}.png" for t in times])
-    # The second depth image is missing: by order, each would get the next one's.
+    # The second depth image is missing, so that depth cannot be assigned by order.
     late = [f"{t + 0.008:.6f}.png" for t in (times[0], times[2])]
     write_images(tmp_path, {"b": [depths[0], depths[2]]}, late)
     source = opened(tmp_path / "a", calib, depth=tmp_path / "b", depth_scale=1000.0)

@@ -17,10 +17,10 @@ N_CAMERAS = 8
 
 
 def drive(offset: float, speed: float = 1.1, noise: float = 0.0, seed: int = 0) -> BundleProblem:
-    """Simulate a car that drives ahead along a street.
+    """Simulate a car that moves ahead along a street.
 
-    All disparities of its stereo pair are ``offset`` px too small. The map is as such a pair would
-    make it: its depths come from the wrong disparities of one frame.
+    All disparities of its stereo pair are ``offset`` px too small. The depths of the map come from
+    the wrong disparities of one frame.
     """
     rng = np.random.default_rng(seed)
     points = np.column_stack(
@@ -34,7 +34,7 @@ def drive(offset: float, speed: float = 1.1, noise: float = 0.0, seed: int = 0) 
     uvr += noise * white_noise(rng, np.ones(len(uvr), bool))
     seen = uvr[::N_CAMERAS].copy()
     first = CAMERA.backproject(seen[:, :2], CAMERA.bf / np.maximum(seen[:, 0] - seen[:, 2], 0.5))
-    order = np.r_[1:N_CAMERAS, 0]  # the first camera is held: it comes last
+    order = np.r_[1:N_CAMERAS, 0]  # the first camera is fixed, so that it comes last
     return BundleProblem(
         T_cw=T_cw[order],
         n_free=N_CAMERAS - 1,
@@ -52,7 +52,7 @@ def test_a_drive_tells_what_the_pair_sees_too_little(offset: float) -> None:
     problem = drive(offset)
     found, information = remaining_offset(problem)
     assert information > 100.0
-    # What is missed grows with the square of the offset; the next window finds it.
+    # The remaining error grows with the square of the offset. The next window corrects it.
     assert found == pytest.approx(offset, rel=0.03, abs=0.001)
     problem.uvr[:, 2] -= found
     assert found + remaining_offset(problem)[0] == pytest.approx(offset, abs=0.002)
@@ -88,5 +88,5 @@ def test_the_error_of_the_estimate_shrinks_with_the_information() -> None:
     assert sigma(0.0) == 0.0  # nothing has been estimated yet
     assert sigma(1e4) == pytest.approx(np.sqrt(VARIANCE) * 0.01, rel=0.01)
     assert sigma(4e4) == pytest.approx(0.5 * sigma(1e4), rel=0.01)
-    free = StereoConfig(offset_sigma=0.0)  # of a loaded map, whose offset is kept
+    free = StereoConfig(offset_sigma=0.0)  # for a loaded map, whose offset is kept
     assert offset_sigma(1e4, free) == pytest.approx(np.sqrt(VARIANCE) * 0.01)

@@ -1,7 +1,4 @@
-"""``vslam doctor`` finds every planted fault and nothing else.
-
-It finds no fault in clean sequences.
-"""
+"""``vslam doctor`` finds every planted fault, and no fault in clean sequences."""
 
 from __future__ import annotations
 
@@ -88,7 +85,7 @@ def shifted(times: np.ndarray) -> np.ndarray:
 
 
 def timed(seen: Seen, times: np.ndarray) -> Seen:
-    """Return the left camera alone, with different times."""
+    """Return the left images alone, with different times."""
     return replace(seen, second=[None] * len(seen), timestamps=times)
 
 
@@ -155,10 +152,7 @@ def test_a_planted_fault_is_found_alone(clean, fault):
     ("baseline", "verdict"), [(0.12, "good"), (12.0, "fault"), (1e-4, "fault")]
 )
 def test_what_the_calibration_says_of_lengths_is_shown(clean, baseline, verdict):
-    """A baseline in a wrong unit is recognised by its size.
-
-    The depths of the matches are proportional to the baseline.
-    """
+    """A baseline in a wrong unit is recognised by the depths of the matches."""
     seen = replace(clean, camera=replace(clean.camera, baseline=baseline))
     (finding,) = (f for f in examine(seen, FEW).findings if f.check == "scale")
     assert finding.verdict == verdict

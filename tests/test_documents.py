@@ -41,10 +41,7 @@ def test_links_and_files_named_exist(document):
 
 
 def files_named(text: str) -> list[str]:
-    """Return the files that a page names.
-
-    Lines that name the commit of a removed script are left out.
-    """
+    """Return the files that a page names, without scripts that are only in git's history."""
     lines = [line for line in text.splitlines() if not IN_HISTORY.search(line)]
     return SOURCE.findall("\n".join(lines))
 
@@ -94,7 +91,6 @@ def test_tests_that_documents_name_exist():
 
 
 def test_the_example_of_the_readme_runs():
-    """The example uses names that the package has, and it tracks a frame."""
     import numpy as np
 
     (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)

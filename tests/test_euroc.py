@@ -46,7 +46,7 @@ def sensor(T: np.ndarray, camera) -> str:
 def root(corridor: StereoSequence, tmp_path: Path) -> Path:
     """The beginning of the corridor in EuRoC's layout.
 
-    Right images are 1 ms late. The ground truth is that of the body.
+    Right images are 1 ms late. The ground truth is the pose of the body.
     """
     base = tmp_path / "V9_01" / "mav0"
     T_left_right = np.eye(4)
@@ -179,10 +179,7 @@ def test_ground_truth_of_some_frames(root, corridor, caplog):
 
 
 def test_ground_truth_between_measurements():
-    """A pose half-way between two measurements is interpolated.
-
-    There are no poses in a gap, before the first or after the last measurement.
-    """
+    """Poses are interpolated, but not in a gap or beyond the ends."""
     T_wc = np.tile(np.eye(4), (4, 1, 1))
     T_wc[:, 0, 3] = 0.0, 1.0, 2.0, 3.0
     T_wc[1, :3, :3] = Rotation.from_rotvec([0.0, 0.2, 0.0]).as_matrix()

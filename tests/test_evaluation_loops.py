@@ -19,7 +19,7 @@ NO_EDGES: list[LoopEdge] = []
 
 
 def along(*corners: tuple[float, float], step: float = STEP_M) -> Poses:
-    """Return ``T_wc`` of a car that drives through the corners (x, z) and looks ahead.
+    """Return ``T_wc`` of a car that passes the corners (x, z) and looks ahead.
 
     There is a pose every ``step`` metres and one at each corner. A corner has the heading of the
     path that leads to it.
@@ -42,13 +42,13 @@ def pose(x: float, z: float, heading: float, y: float = 0.0) -> Poses:
 
 
 def laps(count: float, radius: float = 40.0, step: float = STEP_M) -> Poses:
-    """Return the poses of circles to the right, one pose per metre."""
+    """Return the poses of circles to the right."""
     angles = np.arange(0.0, 2.0 * np.pi * count, step / radius)
     return np.array([pose(radius * (1 - np.cos(a)), radius * np.sin(a), a) for a in angles])
 
 
 def block(*, offset: float = 0.0, overlap: float = 60.0) -> Poses:
-    """Drive once around a block of 100 m, then ``overlap`` metres along the first side again.
+    """Circle a block of 100 m once, then pass ``overlap`` metres of the first side again.
 
     The second time, the car is in a lane ``offset`` metres to the right.
     """
@@ -77,7 +77,7 @@ def test_second_lap_is_one_revisit_of_the_first():
     T_wc, lap = laps(2.0), 2.0 * np.pi * 40.0
     found = revisits(T_wc, times(T_wc))
     assert len(found) == 1
-    # Back from 5 m before the start of the first lap, the lateral limit, to the end.
+    # The revisit begins 5 m (the lateral limit) before the start of the first lap.
     assert found.first[0] == pytest.approx(lap - 5.0, abs=1.5)
     assert found.last[0] == len(T_wc) - 1
     assert found.length_m[0] == pytest.approx(lap + 5.0, abs=2.0)
@@ -86,7 +86,6 @@ def test_second_lap_is_one_revisit_of_the_first():
 
 
 def ramp() -> Poses:
-    """Drive around the block and rise all the time."""
     T_wc = block()
     T_wc[:, 1, 3] = -np.linspace(0.0, 20.0, len(T_wc))
     return T_wc
@@ -98,7 +97,7 @@ def ramp() -> Poses:
         pytest.param(laps(0.97), 0, id="less than a lap"),
         *(pytest.param(block(offset=x), 1, id=f"lane {x} m beside") for x in (0.0, 3.5, 4.9)),
         *(pytest.param(block(offset=x), 0, id=f"lane {x} m beside") for x in (5.1, 8.0)),
-        # 5 m more than the overlap are near enough.
+        # The revisit is 5 m longer than the overlap.
         pytest.param(block(overlap=12.0), 0, id="short"),
         pytest.param(block(overlap=18.0), 1, id="long enough"),
         pytest.param(ramp(), 0, id="height counts as distance"),
@@ -119,7 +118,7 @@ def test_sparse_frames_find_the_same_stretch(every):
 
 
 def test_acute_crossing_is_as_long_as_the_lanes_are_near():
-    # At 15 degrees the paths are within 5 m of each other for 10 / sin 15 = 38.6 m.
+    # At 15 degrees, the paths are within 5 m of each other for 10 / sin 15 = 38.6 m.
     turn = np.radians(15.0)
     ahead = np.array([np.sin(turn), np.cos(turn)])
     start, end = np.array([0.0, 60.0]) - 60.0 * ahead, np.array([0.0, 60.0]) + 60.0 * ahead
@@ -163,10 +162,7 @@ def test_too_few_frames(frames):
 
 
 def test_kidnapping_is_no_path():
-    """The camera jumps by 200 m between two frames.
-
-    A later drive through the gap is no revisit, because the camera was never there.
-    """
+    """The camera jumps by 200 m between two frames, and later passes through the gap."""
     there = along((0, 0), (0, 60))
     far = along((0, 260), (0, 300), (100, 300), (100, 90), (0, 90), (0, 240))
     T_wc = np.concatenate([there, far])

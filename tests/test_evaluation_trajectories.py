@@ -123,7 +123,7 @@ def test_alignment_of_position_noise():
 def test_scale_error_is_drift_in_se3_and_none_in_sim3():
     truth = straight(2001, 0.5)
     drift = kitti_drift(scaled(truth, 1.01).T_wc, truth.T_wc)
-    # Each length ends at the first frame beyond it, here a step of 0.5 m later.
+    # Each length ends at the first frame beyond it, which is 0.5 m later.
     assert drift == pytest.approx((1.0, 0.0), abs=0.003)
     truth = drive()
     assert evaluate_trajectory(scaled(truth, 1.01), truth).ate_rmse_m > 0.5
@@ -143,7 +143,7 @@ def test_yaw_rate_error_gives_its_rate_as_rotation_drift():
     estimate = drive(1801, 0.5, turn=np.radians(error_deg_per_m * 0.5))
     t_rel, r_rel = kitti_drift(estimate.T_wc, truth.T_wc)
     assert r_rel == pytest.approx(100 * error_deg_per_m, rel=0.003)
-    # Over a length L the chord of an arc of curvature c ends about c L^2 / 2 to the side.
+    # After a length L, an arc of curvature c has a lateral offset of about c L^2 / 2.
     lengths, frames = np.arange(100, 801, 100), 1801
     starts = [
         np.arange(0, frames, 10)[np.arange(0, frames, 10) + 2 * x + 1 < frames].size
@@ -173,7 +173,7 @@ def test_different_lengths_are_matched_by_time():
     result = evaluate_trajectory(estimate, truth)
     assert result.frames == 100
     assert result.ate_rmse_m < 1e-9
-    # The other way round, the longer one is the estimate.
+    # Now the longer trajectory is the estimate.
     assert evaluate_trajectory(truth, estimate).frames == 100
 
 

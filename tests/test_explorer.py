@@ -32,7 +32,7 @@ FRAMES = 150
 
 
 def filled(n_keyframes: int, every: int = 1) -> MomentRecorder:
-    """A recorder that has seen several keyframes with distinguishable images."""
+    """Make a recorder that has seen several keyframes with distinguishable images."""
     recorder, outcome = MomentRecorder(), make_outcome(n_keyframes * every)
     rng = np.random.default_rng(0)
     xy = np.stack([rng.uniform(0, 720, 50), rng.uniform(0, 200, 50)], axis=1).astype(np.float32)
@@ -80,7 +80,7 @@ def test_a_moment_is_the_small_image_with_its_keypoints():
 def test_a_moment_knows_its_frame_where_others_were_dropped():
     some = MomentRecorder()
     tracks = make_outcome(12).tracks
-    for frame in (0, 4, 8):  # a recorder is told of no dropped frame
+    for frame in (0, 4, 8):  # a recorder does not get dropped frames
         some.frame(tracks[frame])
         image = np.zeros((200, 720), np.uint8)
         some.keyframe(tracks[frame], image, np.zeros((0, 2)), np.zeros(0, np.bool_))
@@ -196,10 +196,7 @@ fetch("report.html").then(answer => answer.text())
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [400, 1200])
 def test_the_explorer_in_a_browser(run: Path, tmp_path: Path, width: int):
-    """The slider moves through time, and the buttons zoom.
-
-    The page requests nothing from the network.
-    """
+    """The slider moves through time, and the buttons zoom. The page makes no network requests."""
     chromium()
     shutil.copy(run / "report.html", tmp_path)
     (tmp_path / "probe.html").write_text(_PROBE.replace("WIDTH", str(width)))
@@ -294,12 +291,12 @@ def test_nothing_but_reports_is_served_and_to_nobody_else(server):
     assert ask(server, "/", "evil.example:80")[0] == 403
     assert ask(server, "/compare?run=0&run=" + 5000 * "9")[0] == 400
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
-    connection.putrequest("GET", "http://[x/", skip_host=True)  # it would parse the address itself
+    connection.putrequest("GET", "http://[x/", skip_host=True)  # not parsed here
     connection.putheader("Host", "localhost")
     connection.endheaders()
     assert connection.getresponse().status == 400
     assert ask(server, "/", f"localhost:{server.server_port}")[0] == 200
-    assert ask(server, "/", "localhost")[0] == 200  # as at port 80
+    assert ask(server, "/", "localhost")[0] == 200  # without a port, as for port 80
     assert server.server_address[0] == "127.0.0.1"
 
 
@@ -310,10 +307,7 @@ def policy_of(server, path: str) -> str:
 
 
 def test_a_report_of_a_stranger_is_sandboxed(server):
-    """The scripts of the report have no origin.
-
-    Therefore, they can neither read other reports nor load anything.
-    """
+    """Its scripts have no origin. They can neither read other reports nor load anything."""
     policy = policy_of(server, "/run/0").split("; ")
     assert policy[:2] == ["sandbox allow-scripts", "default-src 'none'"]
     for path in ("/", "/compare?run=0&run=1"):
@@ -380,7 +374,7 @@ def test_the_command_serves_until_it_is_interrupted(run: Path):
     import signal
 
     command = [sys.executable, "-u", "-m", "vslam", "report", str(run.parent), "--serve"]
-    # What a shell starts in the background ignores SIGINT, and so do its children.
+    # A process that a shell starts in the background ignores SIGINT, and so do its children.
     listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=listen) as process:
         try:

@@ -112,9 +112,9 @@ def test_a_reconstruction_is_the_living_part_of_a_map(small):
 
 @dataclass
 class Colmap:
-    """The contents of COLMAP's files.
+    """The contents of COLMAP's files by id.
 
-    Images (pose, name, xy, point ids) and points (xyz, rgb, error, track) are given by their ids.
+    Images have a pose, name, xy and point ids. Points have xyz, rgb, an error and a track.
     """
 
     camera: tuple
@@ -244,10 +244,9 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def nerfstudio_errors(folder: Path, reconstruction: Reconstruction) -> np.ndarray:
-    """Return the reprojection errors of the points of ``ply_file_path`` in nerfstudio's cameras.
+    """Return the reprojection errors in pixels of the points of ``ply_file_path``.
 
-    Errors are the distances in pixels to what the keyframes observed. The cameras look along -z,
-    and y is up.
+    In nerfstudio, cameras look along -z, and y is up.
     """
     content = json.loads((folder / "transforms.json").read_text())
     xyz, _ = read_ply(folder / content["ply_file_path"])
@@ -326,7 +325,7 @@ def test_gtsam_reads_the_pose_graph_and_weighs_it_alike(tmp_path):
 
 def test_loops_and_gaps_of_a_run_become_edges(corridor_run, tmp_path):
     grown = small_map()
-    for row in range(grown.rows(5).start, grown.n_rows):  # the last two see what nothing else does
+    for row in range(grown.rows(5).start, grown.n_rows):  # of the last two keyframes
         if grown.arrays.landmark[row] >= 0:
             unlink(grown.arrays, row)
     shared = grown.add_landmarks(np.ones((20, 3)), np.zeros((20, 4), np.uint64), 5)
@@ -375,13 +374,13 @@ def test_evo_reads_the_csv_of_euroc(tmp_path):
     seconds = 1403636579.763555527 + 0.05 * np.arange(4)
     write_euroc(tmp_path / "data.csv", Trajectory(seconds, T_wc))
     first = (tmp_path / "data.csv").read_text().splitlines()[1].split(",")[0]
-    assert abs(int(first) - 1403636579763555527) < 200  # what float64 leaves of it
+    assert abs(int(first) - 1403636579763555527) < 200  # the precision of float64
     read = read_euroc_csv_trajectory(tmp_path / "data.csv")
     np.testing.assert_allclose(read.timestamps, seconds, rtol=0, atol=1e-6)
     np.testing.assert_allclose(read.poses_se3, T_wc, atol=1e-9)
 
 
-# -- what is written is whole, and replaces nothing -----------------------------------------------
+# -- files are complete, and nothing is replaced --------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
@@ -450,7 +449,7 @@ def test_export_colmap_and_nerfstudio(corridor_run, kitti_tree, tmp_path, link):
         for folder in ("c", "n"):
             image = cv2.imread(str(tmp_path / folder / "images" / name), cv2.IMREAD_GRAYSCALE)
             np.testing.assert_array_equal(image, sequence.read(int(name[:6]))[0])
-        # A corner's grey differs between views, but not as between any two pixels.
+        # The grey value of a corner differs less between views than that of random pixels.
         x, y = (np.array(xy) - 0.5).round().astype(int).T
         grey = np.array([model.points[i][1][0] for i in ids], float)
         assert np.corrcoef(image[y, x], grey)[0, 1] > 0.8
@@ -520,7 +519,7 @@ def test_refusals(corridor_run, kitti_tree, tmp_path):
     times.unlink()
     times.write_text("".join(f"{1.0 + float(line)}\n" for line in text.split()))
     assert "use --data to give" in refusal(*words, "--data", other)
-    # A report of another version, and none.
+    # The report has a different version, or is missing.
     run = tmp_path / "run"
     run.mkdir()
     for name in ("map.npz", "config.json"):
@@ -552,10 +551,7 @@ def test_what_can_be_exported_of_a_live_camera(corridor_run, tmp_path):
 
 
 def test_images_are_opened_as_the_run_opened_them(corridor_run, kitti_tree, tmp_path):
-    """The run used its own calibration and every second frame.
-
-    The images were moved to a different folder.
-    """
+    """The run used its own calibration and every second frame. The images were moved afterwards."""
     camera = read_run(corridor_run).camera
     calib = write_calibration(tmp_path / "own.yaml", camera)
     words = ("--calib", calib, "--every", "2", "--no-record", "--no-report", "--quiet")
@@ -575,7 +571,7 @@ def test_images_are_opened_as_the_run_opened_them(corridor_run, kitti_tree, tmp_
 
 
 def test_a_phone_video_in_two_commands(corridor, tmp_path, monkeypatch):
-    """Keyframes and landmarks are exported in colour, although the run itself used grey images."""
+    """Keyframes and landmarks are exported in colour, although the run used grey images."""
     monkeypatch.chdir(tmp_path)
     tinted = [np.dstack([image // 2, image, 255 - image]) for image in corridor.left]
     write_video(Path("phone.mkv"), tinted)

@@ -1,4 +1,4 @@
-"""Every part of a run fails once. No result is lost, and one sentence says what failed."""
+"""Every part of a run fails once. No other result is lost, and one sentence says what failed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vslam.slam import Slam
 
 TOOL = Path(__file__).parents[1] / "tools" / "experiments" / "lifelong" / "inject_faults.py"
 INCOMPLETE = r"^mapping a keyframe failed .* incomplete; continue from a map that was saved before$"
-SOME = [  # of each kind; the tool takes all of them
+SOME = [  # one of each kind; tools/experiments/lifelong tests all of them
     "a frame's track",
     "closing job, fusion",
     "global adjustment",
@@ -39,7 +39,7 @@ def test_every_point_names_a_function_that_exists():
         module, _, name = point.function.rpartition(".")
         try:
             owner = importlib.import_module(module)
-        except ModuleNotFoundError:  # a method
+        except ModuleNotFoundError:  # the name is that of a method
             module, _, owner_name = module.rpartition(".")
             owner = getattr(importlib.import_module(module), owner_name)
         assert callable(getattr(owner, name)), point.name
@@ -47,10 +47,7 @@ def test_every_point_names_a_function_that_exists():
 
 @pytest.mark.slow
 def test_what_fails_in_a_run_costs_itself_alone(tmp_path):
-    """The test runs in a separate process, which forks.
-
-    The process of the tests may have threads and cannot fork.
-    """
+    """A separate process forks, because the process of the tests may have threads."""
     table = tmp_path / "faults.csv"
     words = ["--once", "--points", *SOME, "--out", str(table)]
     done = subprocess.run(
@@ -68,7 +65,7 @@ def test_what_fails_in_a_run_costs_itself_alone(tmp_path):
     "point", [one for one in POINTS if one.function.startswith(CORE)], ids=lambda one: one.name
 )
 def test_a_slam_goes_on_after_a_fault_or_refuses(point, tmp_path, monkeypatch):
-    """The test checks the behaviour that docs/howto/python.md promises."""
+    """This is the behaviour that docs/howto/python.md promises."""
     failing(point, min(5, point.last_call), FAULTS["RuntimeError"], monkeypatch.setattr)
     frames = 40 if point.last_call > 2 else FRAMES
     slam = Slam(CAMERA, None, Oracle(RING, [float(k) for k in range(FRAMES)]), threads=2)

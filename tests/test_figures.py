@@ -61,7 +61,7 @@ def figures(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture
 def project(tmp_path: Path, figures, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A repository with tables.
+    """A repository with four tables.
 
     Two tables can be made, one is from long ago, and one lacks its data.
     """
@@ -155,7 +155,7 @@ def test_a_table_of_another_version_is_listed_and_marked_on_its_page(figures, ma
     assert f"- `docs/research/plot.csv`: {version}, commit" in marked
     assert "finished.csv" not in marked
 
-    assert figures.make(made, quick=False) == 0  # both are made again
+    assert figures.make(made, quick=False) == 0  # both tables are made again
     assert len(figures.check(made).older) == 1
 
 

@@ -46,7 +46,7 @@ def test_rectified_images_are_those_of_a_pinhole_pair(folder, route):
     assert len(sequence) == FRAMES
     wide, seen = wide_camera(SMALL), sequence.camera
     assert seen.baseline == pytest.approx(SMALL.baseline)
-    # The rectified pair has the rendered one's x axis; about it, it may be turned a little.
+    # The x axes of both pairs are equal. The rectified pair may be slightly rotated about it.
     R_wide_seen = np.linalg.inv(route.ground_truth[1, :3, :3]) @ sequence.ground_truth[1, :3, :3]
     np.testing.assert_allclose(R_wide_seen[:, 0], [1, 0, 0], atol=1e-9)
     u, v = np.meshgrid(np.arange(seen.width), np.arange(seen.height))

@@ -26,7 +26,6 @@ N = 150
 
 
 def points() -> np.ndarray:
-    """Return ``(N, 3)`` points in metres, in front of the world's origin."""
     rng = np.random.default_rng(0)
     return np.column_stack([rng.uniform(-5, 5, (N, 2)), rng.uniform(8, 20, N)])
 
@@ -44,10 +43,7 @@ def seen_from(T_camera_w: np.ndarray) -> Features:
 
 
 def place() -> LocalMap:
-    """Return the landmarks of a map whose only keyframe sees all points.
-
-    The keyframe is at the world's origin.
-    """
+    """Return the landmarks of a map whose only keyframe is at the origin and sees all points."""
     map_ = Map(CONTEXT.scales)
     map_.add_keyframe(seen_from(np.eye(4)), np.eye(4), 0.0, 0)
     ids = map_.add_landmarks(points(), descriptors().view(np.uint64), 0)

@@ -65,7 +65,7 @@ def test_frames_take_on_the_unit_of_their_keyframe(keyframes):
     poses = FramePoses(keyframes)
     keyframes.add(np.eye(4))
     keyframes.units[0] = 2.0
-    poses.append(0.0, pose(-1.0), tracked=True)  # measured where a unit is worth two
+    poses.append(0.0, pose(-1.0), tracked=True)  # measured in a map whose unit is twice as long
     assert poses.unit == 2.0
     keyframes.units[0] = 6.0
     np.testing.assert_allclose(poses.pose(0)[:3, 3], [-3.0, 0.0, 0.0], atol=1e-12)
@@ -92,4 +92,4 @@ def test_poses_that_were_only_predicted_are_interpolated(keyframes):
         poses.append(0.1 * k, pose(-1.0 * k if tracked else 7.0), tracked=tracked)
     T_wc = poses.trajectory().T_wc
     np.testing.assert_allclose(T_wc[:3, 0, 3], [0.0, 1.0, 2.0], atol=1e-9)
-    np.testing.assert_allclose(T_wc[3], inverse(pose(7.0)), atol=1e-12)  # nothing follows
+    np.testing.assert_allclose(T_wc[3], inverse(pose(7.0)), atol=1e-12)  # there is no later pose

@@ -40,16 +40,13 @@ def test_every_reader_survives_damaged_files(fuzz, tmp_path: Path):
     assert wrong == []
     assert done.returncode == 0, done.stderr[-3000:]
     assert len(tried) == INPUTS * len(names)
-    # They are harmed noticeably, if not each of them.
+    # Most files are damaged so much that the readers notice it.
     assert sum(line["outcome"] == "refused" for line in tried) > len(tried) / 4
 
 
 @pytest.mark.slow
 def test_maps_that_say_what_cannot_be_are_refused_or_used_to_the_end(fuzz):
-    """The arrays of the maps have the right types and shapes but wrong values.
-
-    Kernels use these values without a check.
-    """
+    """The arrays have the right types and shapes but wrong values, which kernels do not check."""
     found = fuzz.fuzz("map-meaning", 8 * INPUTS, 0)
     assert found["failures"] == []
     assert found["tried"] == 8 * INPUTS
@@ -68,7 +65,6 @@ def test_mutations_are_seeded_and_change_the_file(fuzz):
     ("hang", "wall", "code"), [("import time; time.sleep(60)", 15, 1), ("pass", 300, -27)]
 )
 def test_the_harness_sees_an_exception_a_crash_and_a_hang(tmp_path, hang, wall, code):
-    """The test would be useless if it could not detect failures."""
     script = f"""
 import sys
 sys.path.insert(0, {str(ROOT / "tools")!r})
@@ -90,5 +86,5 @@ fuzz._work("bad", 0, 4, 0, Path({str(tmp_path)!r}))
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert [line["outcome"] for line in lines if "number" in line] == ["KeyError", "memory"]
     assert lines[-1] == {"begin": 2}
-    assert done.returncode == code  # minus SIGPROF: it was out of CPU time
-    assert ", line" in done.stderr  # where it was
+    assert done.returncode == code  # minus SIGPROF: the CPU time was exceeded
+    assert ", line" in done.stderr  # the traceback

@@ -20,7 +20,6 @@ ANGLES = [0.0, 1e-12, 1e-8, 1e-6, 9e-6, 1.1e-5, 9e-5, 1.1e-4, 1e-2, 1.0, 2.5, 3.
 
 
 def twists(angle: float, n: int = 20, seed: int = 0) -> np.ndarray:
-    """Return ``(n, 6)`` twists that rotate by ``angle`` about random axes."""
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=(n, 3))
     axis *= angle / np.linalg.norm(axis, axis=1, keepdims=True)

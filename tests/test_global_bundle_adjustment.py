@@ -1,7 +1,4 @@
-"""Global bundle adjustment is compared with dense optimisation and GTSAM.
-
-Its result is merged into a map.
-"""
+"""Global bundle adjustment is compared with dense optimisation and GTSAM."""
 
 from __future__ import annotations
 
@@ -98,7 +95,7 @@ def test_same_optimum_as_the_dense_one(seed):
     assert ours.cost == pytest.approx(dense.cost, rel=1e-9)
     assert pose_differences(ours.T_cw, dense.T_cw).max() < 1e-6
     np.testing.assert_array_equal(ours.inlier, dense.inlier)
-    # Half a standard deviation of noise leaves a few centimetres; without any, see below.
+    # Half a standard deviation of noise gives errors of a few centimetres.
     before, after = pose_differences(problem.T_cw, truth), pose_differences(ours.T_cw, truth)
     assert after.max() < 0.06 < 0.3 * before.max()
     assert ours.T_cw[-1].tobytes() == problem.T_cw[-1].tobytes()

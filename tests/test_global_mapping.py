@@ -1,7 +1,4 @@
-"""Global bundle adjustment optimises a snapshot.
-
-Its solution is merged into a map that has changed.
-"""
+"""Global bundle adjustment optimises a snapshot. Its solution is merged into a changed map."""
 
 from __future__ import annotations
 
@@ -28,7 +25,6 @@ def world_of(n: int, noise: float = 0.0) -> World:
 
 
 def shifted(snapshot, T: np.ndarray, *, inlier=None) -> BundleSolution:
-    """Return a solution that moves the whole world by ``T``."""
     p = snapshot.problem
     return BundleSolution(
         T_cw=np.array([T_cw @ inverse(T) for T_cw in p.T_cw]),
@@ -92,7 +88,7 @@ def test_what_was_made_since_moves_along(check_map):
     snapshot = take_snapshot(map_, CAMERA)
     for k in (4, 5, 6):
         world.add_keyframe(pose(k))
-    map_.parents[5] = 2  # not the one before
+    map_.parents[5] = 2  # not the previous keyframe
     new = world.link_truth([4, 5, 6])
     new = new[new >= 0]
     assert new.min() >= snapshot.n_landmarks
@@ -108,10 +104,7 @@ def test_what_was_made_since_moves_along(check_map):
 
 
 def test_newer_keyframes_keep_their_pose_relative_to_their_parent():
-    """The keyframes in the solution move differently.
-
-    Newer keyframes form a chain, and each follows its parent.
-    """
+    """The keyframes in the solution move differently. Newer keyframes form a chain."""
     world = world_of(4)
     map_ = world.map
     snapshot = take_snapshot(map_, CAMERA)
@@ -174,7 +167,7 @@ def test_outliers_go_unless_the_row_observes_something_else_by_now(check_map):
     assert a.landmark[snapshot.rows[freed]] == -1
     kept = np.setdiff1d(np.arange(len(observed)), [gone, rewired, freed])
     unchanged = a.landmark[snapshot.rows[kept]] == observed[kept]
-    assert np.count_nonzero(~unchanged) <= 8  # observations of the two that were merged
+    assert np.count_nonzero(~unchanged) <= 8  # observations of the two landmarks that were merged
     check_map(map_)
     link_many(a, snapshot.rows[[gone]], observed[[gone]])  # the row is free and usable
     check_map(map_)

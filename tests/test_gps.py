@@ -70,10 +70,7 @@ def test_the_oxts_folder_of_kitti_raw_is_read(tmp_path):
 
 
 def bag_of(path, rows, kind="ros1", topics=("/gps/fix",)):
-    """Write a bag of GPS fixes.
-
-    Each entry of ``rows`` has the seconds, status, latitude and type of covariance.
-    """
+    """Write a bag of GPS fixes from rows of (seconds, status, latitude, type of covariance)."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
@@ -111,7 +108,7 @@ def test_fixes_of_a_bag_are_read(tmp_path, kind, name):
 
 
 CALIBRATIONS = {
-    # The IMU looks ahead, left and up, as the laser does; the camera right, down and ahead.
+    # Axes of the IMU and laser: ahead, left, up. Axes of the camera: right, down, ahead.
     "calib_imu_to_velo.txt": "R: 1 0 0 0 1 0 0 0 1\nT: -0.81 0.32 -0.8\n",
     "calib_velo_to_cam.txt": "calib_time: 15-Mar-2012 11:37:16\nR: 0 -1 0 0 0 -1 1 0 0\n"
     "T: 0 -0.08 -0.27\ndelta_f: 0 0\n",
@@ -195,10 +192,7 @@ def test_a_missing_library_is_named(call, kitti_tree, tmp_path, monkeypatch):
 
 
 def drive(n, *, turn=0.05, drift=0.0, shrink=0.0, seed=0):
-    """Return the true poses of n keyframes that are 3 m apart.
-
-    Also return the poses of odometry, which drifts.
-    """
+    """Return the true poses of n keyframes that are 3 m apart, and the poses of odometry."""
     rng = np.random.default_rng(seed)
     true, found = [np.eye(4)], [np.eye(4)]
     for k in range(n - 1):
@@ -223,10 +217,7 @@ def graph_of(T_wc, seconds):
 
 
 def measured(true, sigma=1.0, seed=0, antenna=(0.0, 0.0, 0.0)):
-    """Return GPS fixes of all keyframes, one per second.
-
-    Also return the true positions of the camera.
-    """
+    """Return GPS fixes of all keyframes, one per second, and the true positions of the camera."""
     enu = true[:, :3, 3] @ R_ENU_CAMERA.T + np.array([50.0, -20.0, 3.0])
     fixes = enu + true[:, :3, :3] @ np.array(antenna) @ R_ENU_CAMERA.T
     fixes += np.random.default_rng(seed).normal(0.0, sigma, enu.shape)
@@ -268,7 +259,6 @@ def test_the_test_refuses_what_has_jumped_and_little_else():
 
 @pytest.mark.parametrize(("drift", "gain"), [(0.02, 0.75), (2.0, 1.1)])
 def test_an_accurate_map_is_bent_less_than_one_that_drifts(monkeypatch, drift, gain):
-    """The fixes determine how much weight the edges of the map get."""
     true, found = drive(300, drift=drift)
     positions, _ = measured(true)
     graph = graph_of(found, positions.seconds)
@@ -341,10 +331,7 @@ def test_a_short_drive_is_refused():
 
 
 def test_two_keyframes_suffice_for_an_accurate_receiver():
-    """The edge between the keyframes is very short.
-
-    Without the fixes, GTSAM cannot solve the system.
-    """
+    """The edge between them is very short. Without the fixes, GTSAM cannot solve the system."""
     true = np.tile(np.eye(4), (2, 1, 1))
     true[1, 2, 3] = 0.35
     keyframe, ahead = np.array([0, 1, 1, 1, 1, 1]), 0.35 * np.arange(6.0)
@@ -361,7 +348,7 @@ def test_two_keyframes_suffice_for_an_accurate_receiver():
 
 
 def test_the_scale_of_a_monocular_map_is_found_where_it_drifts():
-    true, found = drive(500, drift=0.5, shrink=0.001)  # by a factor of 1.6 to the end
+    true, found = drive(500, drift=0.5, shrink=0.001)  # the scale decreases by a factor of 1.6
     found[:, :3, 3] *= 0.2
     positions, enu = measured(true)
     anchored = anchor(graph_of(found, positions.seconds), positions.seconds, positions, CONFIG,
@@ -374,10 +361,7 @@ def test_the_scale_of_a_monocular_map_is_found_where_it_drifts():
 
 @pytest.mark.parametrize("metric", [True, False])
 def test_the_antenna_need_not_be_at_the_camera(metric):
-    """The antenna is behind and above the camera.
-
-    During the drive, the camera turns by more than 90 degrees.
-    """
+    """The antenna is behind and above the camera, which turns by more than 90 degrees."""
     true, found = drive(300, turn=0.1, drift=0.5)
     if not metric:
         found[:, :3, 3] *= 0.2

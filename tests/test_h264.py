@@ -15,7 +15,7 @@ from vslam.errors import InputError
 av = pytest.importorskip("av")
 
 FRAMES = 24
-TICKS = 90_000  # of a second
+TICKS = 90_000  # per second
 
 
 def write_h264(path: Path, images, times, *, options=None, container=None) -> Path:

@@ -116,7 +116,7 @@ def test_fabmap_matrix_of_pairs_goes_with_the_images_of_one_camera(tmp_path):
     assert [left.names[1], right.names[1]] == ["c/0003.jpg", "c/0004.jpg"]
     assert (left.relation[2, 29], left.relation[29, 2]) == (1, 1)
     assert left.relation[0, 25] == -1
-    assert left.relation[0, 1] == 0  # neighbours in time are not marked, and not different
+    assert left.relation[0, 1] == 0  # neighbours in time are neither the same place nor different
     (single,) = open_source(f"fabmap:{fabmap_folder(tmp_path / 's', 30, truth)}")
     assert len(single) == 30
 
@@ -164,7 +164,7 @@ def test_photographs_follow_the_kind_in_their_notes(tmp_path):
     assert rooms.relation[0].tolist() == [1, 1, 1, 1, -1, -1, -1, -1]
     assert drive.relation[1].tolist() == [1, 1, 1, 0]
     assert zoo.relation[1].tolist() == [-1, 1, -1, -1]
-    assert pano.relation[0].tolist() == [1, 1, 0, 0]  # turning: distant photographs differ
+    assert pano.relation[0].tolist() == [1, 1, 0, 0]  # distant photographs differ
     assert len(set(zoo.unit)) == 4
     assert len(set(rooms.unit)) == 2
     (tmp_path / "zoo" / "NOTES.txt").write_text("animals\n")
@@ -191,7 +191,7 @@ def test_sources_together(tmp_path):
     sources = open_source(f"photos:{tmp_path}")
     collection = load(sources, (20, 20), "crop")
     assert collection.images.shape == (12, 20, 20)
-    assert (collection.relation[:4, 4:8] == 0).all()  # landmarks of one family: not known
+    assert (collection.relation[:4, 4:8] == 0).all()  # landmarks of one family
     assert (collection.relation[:8, 8:] == -1).all()
     with pytest.raises(InputError, match="two sources have the name"):
         load([sources[0], sources[0]], (20, 20), "crop")

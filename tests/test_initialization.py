@@ -22,10 +22,7 @@ AHEAD = se3_exp(np.array([0.05, 0.0, -1.5, 0.01, 0.04, -0.01]))
 
 
 def scene(kind: str, n: int = 300, seed: int = 0) -> np.ndarray:
-    """Return ``(n, 3)`` points in front of the camera.
-
-    They are in a volume, on a slanted wall, or on the floor.
-    """
+    """Return ``(n, 3)`` points in a volume, on a slanted wall, or on the floor."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform([-4.0, -3.0], [4.0, 3.0], (n, 2))
     if kind == "wall":
@@ -37,10 +34,7 @@ def scene(kind: str, n: int = 300, seed: int = 0) -> np.ndarray:
 
 
 def views(points, T_2_1, *, noise=0.5, outliers=0.0, seed=0):
-    """Return the ``(N, 2)`` pixels of the points in both views.
-
-    A share of the pixels in the second view is random.
-    """
+    """Return the ``(N, 2)`` pixels of the points in both views. In the second, some are random."""
     rng = np.random.default_rng(seed)
     seen = [CAMERA.project(p)[:, :2] for p in (points, transform(T_2_1, points))]
     xy_1, xy_2 = (xy + rng.normal(0, noise, xy.shape) for xy in seen)
@@ -85,7 +79,7 @@ def test_an_essential_matrix_gives_its_motion_back(T):
     assert all(abs(np.linalg.det(M[:3, :3]) - 1) < 1e-9 for M in found)
     errors = [max(turn_deg(M[:3, :3], T[:3, :3]), angle_deg(M[:3, 3], t)) for M in found]
     assert sorted(errors)[0] < 1e-5
-    assert sorted(errors)[1] > 1.0  # the three others are other motions
+    assert sorted(errors)[1] > 1.0  # the three other solutions are wrong
 
 
 @pytest.mark.parametrize("T", [ASIDE, AHEAD])
@@ -124,7 +118,7 @@ def test_a_wall_leaves_two_motions_and_none_is_taken():
 
 
 def test_motion_along_a_floor():
-    """A plane allows a second motion. This motion would put half of the floor behind the camera."""
+    """A plane allows a second motion, which would put half of the floor behind the camera."""
     aside = se3_exp(np.array([-1.0, 0.0, 0.1, 0.0, 0.1, 0.0]))
     points = scene("floor", 400)
     xy_1, xy_2, right = views(points, aside, noise=0.2, outliers=0.2)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numba
 import pytest
 
-# Writes what it loaded of Numba's compiler, then the result, in a process of its own.
+# A separate process prints the loaded modules of Numba's compiler, and then the result.
 INNER = """
 import sys
 import numpy as np
@@ -144,7 +144,7 @@ def test_kernels_that_do_not_fit_on_the_disk(tmp_path: Path) -> None:
 def test_an_installation_without_a_writable_folder(tmp_path: Path, numba_of: str) -> None:
     source = INNER if numba_of != "UNKNOWN" else INNER.replace("from vslam.kernels", UNKNOWN, 1)
     (tmp_path / "inner.py").write_text(source)
-    (tmp_path / "__pycache__").touch()  # no folder can be made, even by root
+    (tmp_path / "__pycache__").touch()  # not even root can make a folder here
     nowhere = {name: "/dev/null/none" for name in ("NUMBA_CACHE_DIR", "HOME", "XDG_CACHE_HOME")}
     (tmp_path / "temporary").mkdir()
     nowhere["TMPDIR"] = str(tmp_path / "temporary")

@@ -53,7 +53,7 @@ def test_a_frame_without_features_is_judged_by_the_close_points_that_are_left():
     assert not decide(**by_patches, tracked_close=800)
     assert decide(**by_patches, tracked_close=int(CONFIG.patch_kept_close * 900) - 1)
     assert not decide(**by_patches, tracked_close=int(CONFIG.patch_kept_close * 900))
-    assert not decide(first_close=900, tracked_close=101)  # it has features
+    assert not decide(first_close=900, tracked_close=101)  # the image has features
 
 
 @pytest.mark.parametrize("idle", [True, False])
@@ -88,10 +88,10 @@ def test_where_keyframes_bring_few_close_points_losing_most_of_those_makes_one()
     assert not decide(tracked_close=16, **few)
     assert decide(tracked_close=15, **few)
     assert not decide(tracked_close=15, gained_close=80.0, untracked_close=70)
-    # Not in fog, where there are no far points to hold the pose, either.
+    # In fog, there are no far points that would constrain the pose.
     assert decide(tracked_close=16, n_inliers=115, n_reference=100, **few)
     assert not decide(tracked_close=16, n_inliers=116, n_reference=100, **few)
-    # Where they bring enough, all of these are wanted.
+    # If keyframes bring enough close points, all of these are wanted.
     assert decide(tracked_close=99, gained_close=100.0)
 
 
@@ -148,7 +148,7 @@ KNOWN = {"n_inliers": 150, "n_shared": 100, "n_place": 200}
     ({"n_inliers": 149}, False),
     ({"n_shared": 99}, False),
     ({"n_place": 10, "n_inliers": 50, "n_shared": 5}, True),
-    ({"n_place": 10, "n_inliers": 49, "n_shared": 49}, False),  # the end of a map
+    ({"n_place": 10, "n_inliers": 49, "n_shared": 49}, False),  # at the end of a map
 ])  # fmt: skip
 def test_a_place_is_known_that_is_tracked_like_its_old_keyframe(changes, known):
     config = Config(keyframes=KeyframeConfig(max_tracked_ratio=0.75, known_ratio=0.5))
@@ -167,7 +167,6 @@ def policy(camera=CAMERA) -> KeyframePolicy:
 
 
 def frame(*, close: int, far: int = 0) -> Frame:
-    """Make a frame that tracks the given numbers of close and of far points."""
     tracked = POINTS.tracked_frame(3, 0.3, np.eye(4))
     is_close = POINTS.xyz[:, 2] < 20.0
     for among, n in ((is_close, close), (~is_close, far)):
@@ -177,10 +176,7 @@ def frame(*, close: int, far: int = 0) -> Frame:
 
 
 def observe(of: KeyframePolicy, seen: Frame, **changes) -> KeyframeEvidence:
-    """Return the decision of a policy about a frame 0.3 s after a keyframe.
-
-    No keyframe is being mapped at this time.
-    """
+    """Return the decision of a policy about a frame 0.3 s after a keyframe. Mapping is idle."""
     known = {"seconds_since_keyframe": 0.3, "mapping_idle": True}
     return of.observe(seen, POINTS.view(n_reference=200), **known | changes)
 
@@ -214,7 +210,7 @@ def test_only_the_first_frame_after_a_keyframe_tells_what_keyframes_gain():
     one = policy()
     assert observe(one, frame(close=10)).gained_close == 200.0  # no keyframe was made
     one.keyframe_made()
-    # It counts at once: a fifth of the way from 200 to 10.
+    # The value counts at once. It is a fifth of the way from 200 to 10.
     assert observe(one, frame(close=10)).gained_close == pytest.approx(162.0)
     assert observe(one, frame(close=40)).gained_close == pytest.approx(162.0)
 
@@ -222,7 +218,7 @@ def test_only_the_first_frame_after_a_keyframe_tells_what_keyframes_gain():
 def test_a_keyframe_is_planned_for_the_frame_that_will_have_lost_too_many_close_points():
     """The limit is 0.4 of the 1,000 close points, which is 400.
 
-    Each frame tracks 0.8 of the close points of the frame before.
+    Each frame tracks 0.8 of the close points of the previous frame.
     """
     one = policy()
     losing = replace(
@@ -249,7 +245,7 @@ def test_close_points_are_lost_from_the_first_frame_after_a_keyframe_on():
     seen = frame(close=5)
     seen.index += 2
     assert observe(one, seen).close_ratio == pytest.approx(0.5)
-    assert observe(one, frame(close=0)).close_ratio == 1.0  # that one is no share
+    assert observe(one, frame(close=0)).close_ratio == 1.0  # a value of 1 disables the share
 
 
 @pytest.mark.parametrize("awaited", [True, False])

@@ -312,10 +312,7 @@ def test_bad_poses(root, line, part):
 
 
 def test_another_calibration_than_its_own(root):
-    """A given calibration is used instead of ``calib.txt``, which may be missing.
-
-    Images are rectified if the calibration has distortion.
-    """
+    """A given calibration may have distortion. ``calib.txt`` may be missing."""
     raw = open_kitti(root, "00").read(0)[0]
     (root / "sequences/00/calib.txt").unlink()
     one = "{focal: [60, 60], centre: [31, 15], distortion: [-0.1, 0, 0, 0]}"

@@ -1,4 +1,4 @@
-"""Loops are verified by learned local descriptors, from another viewpoint and in other light."""
+"""Loops are verified by learned local descriptors, from other viewpoints and in other light."""
 
 from __future__ import annotations
 
@@ -31,10 +31,7 @@ CONFIG = Config()
 
 
 def wall(seed: int) -> np.ndarray:
-    """Make a painted wall of 40 by 16 metres with 80 pixels per metre.
-
-    It has rectangles, lines and spots.
-    """
+    """Make a painted wall of 40 by 16 metres with 80 pixels per metre."""
     rng = np.random.default_rng(seed)
     image = np.full((1280, 3200), 128, np.uint8)
     for _ in range(900):
@@ -106,7 +103,7 @@ class World:
             xyz = centre + rays * ((DEPTH - centre[2]) / rays[:, 2])[:, None]
             pose = T_cw
             if keyframe == 1:
-                # Its own landmarks and pose, in another unit and moved by the drift.
+                # Keyframe 1 has its own landmarks and pose, with drift and with another scale.
                 local = transform(T_cw, xyz) * unit
                 pose = T_cw @ drift
                 pose[:3, 3] *= unit
@@ -133,7 +130,7 @@ def test_a_place_by_night_from_the_side_is_found_to_centimetres(network):
     assert np.linalg.norm(error[:3, 3]) < 0.1
     assert np.degrees(np.arccos((np.trace(error[:3, :3]) - 1) / 2)) < 0.5
     assert edge.n_inliers >= CONFIG.learned.min_inliers
-    # Features of the query are paired with landmarks of the place where these appear.
+    # Features of the query match the landmarks of the place that project onto them.
     assert len(edge.features) == len(set(edge.features)) == len(set(edge.landmarks)) > 30
 
 
@@ -163,7 +160,7 @@ def test_a_lost_frame_is_recognised(network):
     maps = network.describe(world.night)
     features = Features.none()
     given = (world.map, maps, features, 0, world.images, CAMERA, CONFIG)
-    assert recognise(*given) is None  # no keypoint to go on with
+    assert recognise(*given) is None  # there are no keypoints
     rows = world.map.rows(1)
     a = world.map.arrays
     features = Features(a.xy[rows], a.octave[rows], a.angle[rows], np.zeros(0), a.u_right[rows])
@@ -189,7 +186,7 @@ def test_each_feature_takes_the_nearest_pixel():
     feature, index = nearest_features(uv, xy, octave, 1.2 ** np.arange(8.0), CONFIG.learned)
     assert sorted(zip(feature.tolist(), index.tolist(), strict=True)) == [(0, 1), (1, 2)]
     one, _ = nearest_features(uv[:1], xy[[0, 0]], octave[:2], 1.2 ** np.arange(8.0), CONFIG.learned)
-    assert one.tolist() == [0]  # of two at one pixel the finer, which comes first
+    assert one.tolist() == [0]  # the finer one of two at the same pixel
     none = nearest_features(uv[:0], xy, octave, np.ones(8), CONFIG.learned)
     assert [len(x) for x in none] == [0, 0]
 
@@ -216,7 +213,7 @@ def test_only_what_looks_alike_is_tried_and_less_after_a_try_in_vain():
     assert trials.choose(59, candidates(0.43)) == {0}
     trials.record(candidates(0.4)[0], located=True)
     assert trials.choose(51, candidates(0.36)) == {0}
-    # However small the similarity of the last one was, the least that is tried stays.
+    # The smallest similarity that is tried does not decrease, although the last one was 0.1.
     trials.record(candidates(0.1)[0], located=False)
     assert trials.choose(52, candidates(0.3)) == set()
 
@@ -237,7 +234,7 @@ def test_candidates_that_no_detector_compared_are_compared_where_the_camera_may_
         candidates, lambda: images.glance_at(view), images, CONFIG.learned, beyond
     )
     assert found[0].similarity > 0.9 > found[1].similarity
-    # Rated by its detector, beyond reach, without an image: as they were.
+    # These candidates keep their order: rated by a detector, too far away, or without an image.
     assert found[2:] == candidates[2:]
     first = CONFIG.learned.model_copy(update={"max_compared": 1})
     found = with_similarities(candidates, lambda: images.glance_at(view), images, first, beyond)
@@ -269,4 +266,5 @@ def test_no_network_sees_what_an_image_shows_already(network):
     assert is_image_redundant(map_, 2, images, config)
     higher = config.model_copy(update={"most_shared": 0.41})
     assert not is_image_redundant(map_, 2, images, higher)
-    assert is_image_redundant(map_, 1, images, config)  # two in a row are not seen
+    # The image of the previous keyframe is stored.
+    assert is_image_redundant(map_, 1, images, config)

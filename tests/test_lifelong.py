@@ -27,10 +27,7 @@ def view(k: int) -> Features:
 
 @cache
 def laps(known_after_s: float, threads: int = 1) -> tuple[Slam, tuple[int, ...], list]:
-    """Drive five laps of the ring, 21 s each.
-
-    Returns the number of keyframes that exist after each lap.
-    """
+    """Track five laps of the ring, 21 s each. Return the number of keyframes after each lap."""
     config = Config.model_validate({"keyframes": {"known_after_s": known_after_s}})
     slam = Slam(CAMERA, config, Oracle(RING, PLACES), threads=threads)
     keyframes, results = [], []
@@ -48,7 +45,7 @@ def laps(known_after_s: float, threads: int = 1) -> tuple[Slam, tuple[int, ...],
 def test_known_streets_do_not_grow_the_map(check_map):
     slam, keyframes, results = laps(10.0)
     _, growing, _ = laps(NEVER_KNOWN)
-    assert keyframes[0] == growing[0]  # the first lap is new to both
+    assert keyframes[0] == growing[0]  # in the first lap, both add keyframes
     assert keyframes[-1] < 1.4 * keyframes[1]
     assert growing[-1] > 1.4 * growing[0]
     assert sum(result.is_keyframe for result in results[3 * LAP :]) < 20
@@ -59,7 +56,7 @@ def test_known_streets_do_not_grow_the_map(check_map):
 def test_what_is_known_is_tracked_no_worse():
     mean = [float(errors(laps(known)[0], RING, PLACES).mean()) for known in (10.0, NEVER_KNOWN)]
     assert mean[0] < 1.1 * mean[1]
-    # Until the loop is closed, one frame may see two parts of the map that do not fit.
+    # Before the loop is closed, one frame may see two parts of the map that do not agree.
     assert sum(result.n_inliers <= 60 for result in laps(10.0)[2][2 * LAP :]) <= 1
 
 
@@ -70,10 +67,7 @@ def test_known_streets_give_the_same_bytes_with_one_thread_and_two():
 
 
 def with_some_of(features: Features, other: Features, n: int) -> Features:
-    """Return features together with n features of a different view.
-
-    This simulates a street that looks repetitive.
-    """
+    """Add n features of a different view, as on a street that looks repetitive."""
     some = np.linspace(0, len(other) - 1, n).astype(int)
     names = ("xy", "octave", "angle", "descriptors", "u_right")
     columns = ((getattr(features, name), getattr(other, name)) for name in names)

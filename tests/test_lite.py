@@ -53,10 +53,7 @@ def imagenet_state(seed: int = 0) -> dict[str, torch.Tensor]:
 
 
 def reference(state: dict[str, torch.Tensor], images: torch.Tensor) -> torch.Tensor:
-    """Compute the published network on colour images ``(x - 127) / 128``.
-
-    The padding is that of TensorFlow.
-    """
+    """Compute the published network on colour images ``(x - 127) / 128``, with its padding."""
 
     def layer(x, conv, norm, stride=1, groups=1, active=True):
         weight = state[f"{conv}.weight"]
@@ -90,9 +87,9 @@ def imagenet(tmp_path: Path) -> Path:
 @pytest.mark.slow
 @torch.no_grad()
 def test_the_published_network_is_computed(imagenet):
-    """The input are grey images with a standard deviation of 1.
+    """The network gets grey images with a standard deviation of 1.
 
-    The output must equal that of the published network at a standard deviation of 0.5.
+    Its output must equal that of the published network at a standard deviation of 0.5.
     """
     extractor = LiteExtractor()
     extractor.load_imagenet(imagenet)
@@ -160,7 +157,7 @@ def test_fine_tuning_leaves_the_first_blocks_and_moves_the_rest_slowly(tmp_path,
     extractor = {key for key in moved if key.startswith("branch.extractor.")} - frozen
     others = {key for key in moved if key.startswith(("branch.primary", "branch.capsules"))}
     assert {moved[key] for key in frozen} == {0.0}
-    # Adam's first steps are as large as the learning rate, whatever the gradient.
+    # The first steps of Adam are as large as the learning rate, independent of the gradient.
     assert 0.0 < max(moved[key] for key in extractor) <= 2.1 * 1e-5
     assert max(moved[key] for key in others) > 1e-4
 

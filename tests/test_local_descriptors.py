@@ -86,11 +86,11 @@ def test_keyframes_are_kept_small_and_described_when_asked_for(network, monkeypa
     assert images.maps(0) is first
     for k in (1, 2):
         images.maps(k)
-    again = images.maps(0)  # forgotten and described anew
+    again = images.maps(0)  # computed again, because they are no longer cached
     assert again is not first
     assert np.array_equal(again.coarse, first.coarse)
     assert np.array_equal(again.fine, first.fine)
-    # JPEG changes little.
+    # JPEG changes the descriptors only slightly.
     plain = network.describe(picture(0))
     assert (plain.coarse * first.coarse).sum(2).mean() > 0.98
 

@@ -60,10 +60,7 @@ class World:
     def add_keyframe(
         self, T_cw: np.ndarray, *, mono: bool = False, noise: float = 0.0, among=None
     ) -> int:
-        """Add a keyframe that sees every point, or only those in ``among``.
-
-        The features of its image are in random order.
-        """
+        """Add a keyframe that sees every point, or only those in ``among``, in random order."""
         in_camera = transform(T_cw, self.points)
         uvr = CAMERA.project(np.where(in_camera[:, 2:] > 0.5, in_camera, 1.0))
         uvr += noise * white_noise(self.rng, np.full(len(uvr), not mono))
@@ -117,10 +114,7 @@ class World:
         return landmark_of
 
     def point_of_landmark(self, landmark: int) -> set[int]:
-        """Return the points that a landmark observes.
-
-        It is a single point, unless the map has confused points.
-        """
+        """Return the points that a landmark observes. A correct landmark observes one point."""
         rows = np.flatnonzero(self.map.arrays.landmark[: self.map.n_rows] == landmark)
         return set(self.point_of_row[rows].tolist())
 
@@ -251,7 +245,7 @@ def test_features_near_an_epipolar_line_are_in_its_section(t):
     np.testing.assert_allclose(across @ t, 0.0, atol=1e-12)
     np.testing.assert_allclose(across @ across.T, np.eye(2), atol=1e-12)
     start, items = sorted_about_epipole(x, y, gate, CAMERA.intrinsics, across)
-    assert len(items) < 20 * n  # of 512: most are in few
+    assert len(items) < 20 * n  # of 512 bins, most features are in few
     pixels = np.column_stack([x, y, np.ones(n)])
     for d in np.column_stack([rng.uniform(-1, 1, (300, 2)), np.ones(300)]):
         normal = np.cross(t, d) / [CAMERA.fx, CAMERA.fy, 1.0]
@@ -265,7 +259,7 @@ def test_features_near_an_epipolar_line_are_in_its_section(t):
 
 def test_triangulation_along_the_axis_spares_the_epipole():
     world = make_world()
-    world.points[0] = [0.0, 0.0, 20.0]  # where the camera heads
+    world.points[0] = [0.0, 0.0, 20.0]  # straight ahead of the camera
     world.add_keyframe(inverse(sideways(0, forward=0.0)), mono=True)
     world.add_keyframe(sideways(0, forward=2.0), mono=True)
     xyz, rows_1, rows_2 = triangulate(world, 0, 1)
@@ -294,7 +288,8 @@ def test_triangulation_needs_a_baseline_and_parallax():
     world.add_keyframe(np.eye(4), mono=True)
     world.add_keyframe(sideways(0.49), mono=True)
     assert len(triangulate(world, 0, 1)[0]) == 0
-    world.map.arrays.T_cw[1] = sideways(0.51)  # long enough, but rays meet at half a degree
+    # The baseline is long enough, but the parallax is half a degree.
+    world.map.arrays.T_cw[1] = sideways(0.51)
     assert len(triangulate(world, 0, 1)[0]) == 0
 
 
@@ -521,7 +516,7 @@ def test_keyframes_outside_the_window_are_held():
     world = make_world(n=700, depth=(6, 25))
     for k in range(8):
         world.add_keyframe(sideways(0.1 * k))
-    # Keyframes 0..3 share points with each other, 3..7 too; 0..2 share only ten with 4..7.
+    # Keyframes 0..3 share points, and so do 3..7. Keyframes 0..2 share only ten with 4..7.
     left, right, bridge = np.arange(300), np.arange(300, 690), np.arange(690, 700)
     landmarks = world.link_truth(range(4), left)
     assert (landmarks >= 0).any()
@@ -604,20 +599,20 @@ def test_observers_at_a_coarser_scale_do_not_make_a_keyframe_redundant():
     a.octave[world.map.rows(0)] = a.octave[world.map.rows(1)] = a.octave[world.map.rows(3)] = 2
     cull_keyframes(world.map, 5, CAMERA, CONFIG)
     assert 2 in world.map.living_keyframes()
-    a.octave[world.map.rows(3)] = 1  # three at most one level coarser: 3, 4 and 5
+    a.octave[world.map.rows(3)] = 1  # keyframes 3, 4 and 5 are at most one level coarser
     cull_keyframes(world.map, 5, CAMERA, CONFIG)
     assert 2 not in world.map.living_keyframes()
 
 
 def test_the_first_keyframe_is_never_culled():
-    world = redundant_world(own=0)  # each is redundant as long as three others are left
+    world = redundant_world(own=0)  # each is redundant if three others remain
     cull_keyframes(world.map, 5, CAMERA, CONFIG)
     living = world.map.living_keyframes().tolist()
     assert len(living) == 3
     assert (living[0], living[-1]) == (0, 5)
 
 
-# -- all of it ------------------------------------------------------------------------------------
+# -- all steps together ---------------------------------------------------------------------------
 
 
 def test_mapping_a_keyframe_keeps_the_map_sound_and_true(check_map):

@@ -21,7 +21,6 @@ def unit(x: np.ndarray) -> np.ndarray:
 
 
 def field(seed: int, rows: int = 12, columns: int = 40) -> np.ndarray:
-    """Make a smooth field of descriptors at every pixel of the image that a network reads."""
     rng = np.random.default_rng(seed)
     coarse = rng.standard_normal((rows, columns, 32)).astype(np.float32)
     size = columns * 16, rows * 16
@@ -30,10 +29,7 @@ def field(seed: int, rows: int = 12, columns: int = 40) -> np.ndarray:
 
 
 def maps(pixels: np.ndarray, scale: float = 1.0) -> DescriptorMaps:
-    """Make maps of descriptors.
-
-    Coarse descriptors depend on a larger part of the image than fine descriptors.
-    """
+    """Make maps of descriptors. Coarse ones depend on a larger part of the image than fine ones."""
     wide = np.stack([cv2.GaussianBlur(pixels[..., c], (0, 0), 12.0)
                      for c in range(pixels.shape[2])], 2)  # fmt: skip
     return DescriptorMaps(unit(wide[::16, ::16]), unit(pixels[::4, ::4]), scale)
@@ -104,5 +100,5 @@ def test_a_point_must_lead_back():
     place = np.array([[308.0, 90.0], [324.0, 90.0]], np.float32)
     expected = np.array([[308.0, 90.0], [308.0, 90.0]])
     assert locate_near(place, expected, a, b, 2, 0.3).found.tolist() == [True, True]
-    # Once the window holds both, only the true one is the nearest of what was found.
+    # If the window contains both places, only the true one is matched in both directions.
     assert locate_near(place, expected, a, b, 5, 0.3).found.tolist() == [True, False]

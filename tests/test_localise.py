@@ -36,7 +36,7 @@ def new(threads: int = 1) -> Slam:
 
 
 def drive(slam: Slam, ring: Ring, places, seed: int, start: float = 0.0) -> list[TrackResult]:
-    """Drive at ten frames per second. None stands for a black image."""
+    """Track ten frames per second. None stands for a black image."""
     results = [
         slam.step_features(NOTHING if k is None else Extracted(ring.see(k, seed)), start + 0.1 * i)
         for i, k in enumerate(places)
@@ -64,7 +64,6 @@ def everything(slam: Slam) -> bytes:
 
 @pytest.fixture(scope="module")
 def file(ring, tmp_path_factory) -> Path:
-    """A map file of the first 100 places of the ring."""
     slam = new()
     drive(slam, ring, range(100), seed=0)
     path = tmp_path_factory.mktemp("maps") / "ring.npz"
@@ -87,10 +86,7 @@ def test_localising_finds_every_frame_and_changes_nothing(file, ring):
 
 
 def test_localising_backwards_through_the_map_looks_around_where_it_is(file, ring):
-    """The reference keyframe follows the camera.
-
-    It does not stay the keyframe at which the camera was relocalised.
-    """
+    """The reference keyframe follows the camera."""
     slam = Slam.load(file, threads=1, localize=True)
     places = [80 - 0.5 * k for k in range(120)]
     results = drive(slam, ring, places, seed=2)
@@ -104,7 +100,7 @@ def test_localising_outside_the_map_is_lost_and_found_again(file, ring):
     results = drive(slam, ring, places, seed=3)
     assert states(results) == "L" * 10 + "O" * 10 + "L" * 5 + "O" * 5
     assert slam.in_map().tolist() == [False] * 10 + [True] * 10 + [False] * 5 + [True] * 5
-    # Before it was found, the camera stands where it was found.
+    # Earlier frames have the pose at which the camera was found.
     T_wc = slam.trajectory().T_wc
     assert np.array_equal(T_wc[0], T_wc[10])
     assert np.array_equal(T_wc[9], T_wc[10])
@@ -132,7 +128,7 @@ def test_going_on_extends_the_map_and_closes_the_ring(file, ring, check_map):
     assert not slam.map.restarts
     assert (slam.map.sessions[:n] == 0).all()
     assert set(slam.map.sessions[n:]) == {1}
-    # It came round to where the first drive began: a loop from one drive to the other.
+    # The camera reached the start of the first drive, which closes a loop between both drives.
     closed = [edge for edge in slam.loops if edge.accepted]
     assert closed
     assert all(edge.match < n <= edge.query for edge in closed)
@@ -154,7 +150,7 @@ def test_elsewhere_a_submap_begins_until_a_loop_joins_it(file, ring, check_map, 
     tracked = np.array([result.state != TrackingState.LOST for result in results])
     assert slam.in_map()[tracked].mean() > 0.99
     assert off(slam, ring, places)[tracked].max() < 1.5
-    # What was joined is one part, also after it was saved.
+    # Parts that were joined are still one part after saving.
     slam.save(tmp_path / "joined.npz", "again")
     again = Slam.load(tmp_path / "joined.npz", threads=1, localize=True)
     drive(again, ring, range(160, 165), seed=6)
@@ -220,7 +216,7 @@ def test_a_drive_without_a_keyframe_yet_is_resumed(ring, tmp_path):
     assert len(second.trajectory()) == 12
     again = Slam.load(tmp_path / "empty.npz", threads=1)
     drive(again, ring, range(2), seed=1)
-    assert again.stored_map("ring").drives == ("ring",)  # as many as keyframes are of
+    assert again.stored_map("ring").drives == ("ring",)  # only drives that have keyframes
 
 
 def test_a_drive_through_known_places_is_resumed_by_its_own_clock(file, ring, tmp_path):
@@ -228,7 +224,7 @@ def test_a_drive_through_known_places_is_resumed_by_its_own_clock(file, ring, tm
     assert not any(result.is_keyframe for result in drive(first, ring, range(10, 14), seed=2))
     first.save(tmp_path / "second.npz", "ring")
     second = Slam.load(tmp_path / "second.npz", threads=1, resume=True)
-    # The map's last keyframe is of another drive, and of a later time of day.
+    # The last keyframe of the map belongs to another drive, with a later time of day.
     results = drive(second, ring, [*range(14, 120)], seed=2, start=0.4)
     assert states(results) == "O" * 106
 
@@ -276,7 +272,6 @@ def refusal(*words: object) -> str:
 
 @pytest.fixture(scope="module")
 def mapped(kitti_tree, tmp_path_factory) -> Path:
-    """A run over the first 20 frames of the corridor."""
     out = tmp_path_factory.mktemp("mapped")
     words = ("--data", kitti_tree, "--no-record", "--no-report", "--quiet", "--out", out)
     result = vslam("run", *words, "--max-frames", 20, "--save-map", out / "kept.npz")
@@ -300,7 +295,7 @@ def test_localise_by_the_command_line(kitti_tree, mapped, tmp_path):
     figures = report["in_map"]
     assert (figures["in_map_percent"], figures["found"], figures["sought"]) == (100.0, 1, 1)
     assert figures["first_fix_s"] == 0.0
-    # Each alignment has its own idea of where the corridor lies: by the map's the error is greater.
+    # The alignment of the map gives a larger error than an alignment of this drive.
     assert report["ate_rmse_m"] <= figures["error_m"] < 0.1
     assert not (tmp_path / "latest" / "map.npz").exists()
     assert (mapped / "map.npz").read_bytes() == before

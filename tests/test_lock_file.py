@@ -65,7 +65,7 @@ while entered < 100:
             time.sleep(0.0002)
             (folder / "inside").unlink()
             entered += 1
-        (folder / ".lock").write_text("999999999")  # as a killed process once left it
+        (folder / ".lock").write_text("999999999")  # left by a killed process
     except InputError:
         pass
 """
@@ -73,10 +73,7 @@ while entered < 100:
 
 @pytest.mark.slow
 def test_processes_that_race_get_in_one_at_a_time(tmp_path):
-    """When a process releases the lock, it removes the file.
-
-    Other processes may have opened this file just before.
-    """
+    """A process that releases the lock removes a file that others may have opened just before."""
     command = [sys.executable, "-c", RACER, str(tmp_path)]
     racers = [subprocess.Popen(command) for _ in range(4)]
     assert [racer.wait(timeout=300) for racer in racers] == [0] * 4

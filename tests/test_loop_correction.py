@@ -17,7 +17,7 @@ def world_of_five() -> World:
     world = make_world(300)
     for T_cw in POSES:
         world.add_keyframe(T_cw, noise=0.3)
-    for k in range(5):  # a fifth of the landmarks begins at each keyframe
+    for k in range(5):  # each keyframe creates a fifth of the landmarks
         world.link_truth(range(k, 5), chosen=np.arange(60 * k, 60 * k + 60))
     return world
 
@@ -28,7 +28,6 @@ def moved_poses(keyframes) -> np.ndarray:
 
 
 def reprojection(world: World, keyframe: int, landmarks: np.ndarray) -> np.ndarray:
-    """Return ``(N, 3)`` projections of landmarks into a keyframe."""
     a = world.map.arrays
     return CAMERA.project(transform(a.T_cw[keyframe], a.xyz[landmarks]))
 

@@ -41,7 +41,7 @@ def closed_map() -> Map:
     """
     map_ = Map(1.2 ** np.arange(8))
     T_cw = np.eye(4)
-    T_cw[0, 3] = -1.0  # the neighbour and the query stand 1 m to the right of the match
+    T_cw[0, 3] = -1.0  # the neighbour and the query are 1 m to the right of the match
     for frame, pose in zip(FRAMES, (np.eye(4), T_cw, T_cw), strict=True):
         map_.add_keyframe(features(8), pose, 0.1 * frame, frame)
     points = [[1, 0, 10], [2, 1, 10], [3, 1, 10], [0, 0, 10], [0, 0, -5], [30, 0, 10]]
@@ -50,7 +50,7 @@ def closed_map() -> Map:
     link_many(a, map_.rows(MATCH).start + np.array([6, 7]), place[[0, 1]])
     link_many(a, map_.rows(NEIGHBOUR).start + np.arange(6), place)
     link_many(a, map_.rows(QUERY).start + np.array([0, 2, 4, 5]), place[[0, 2, 4, 5]])
-    # Feature 1 observed a landmark of the query's own, which fusion merged into that of the place.
+    # Feature 1 observed a landmark of the query, which was fused with a landmark of the place.
     own = map_.add_landmarks(np.array([[2.0, 1.0, 10.1]]), np.zeros((1, 4), np.uint64), QUERY)
     link(a, map_.rows(QUERY).start + 1, int(own[0]))
     merge_landmarks(a, int(own[0]), int(place[1]))
@@ -65,7 +65,7 @@ LOOP = LoopEdge(
 
 def test_matches_are_pixels_of_the_same_landmarks(closed_map: Map) -> None:
     query_xy, match_xy = loop_matches(closed_map, LOOP, CAMERA)
-    # Feature 3 has lost its landmark; landmark 4 is behind the match and 5 outside its image.
+    # Feature 3 has lost its landmark. Landmark 4 is behind the match, and 5 is outside its image.
     np.testing.assert_array_equal(query_xy, [[10, 20], [11, 22], [12, 24]])
     observed = [[16, 32], [17, 34]]  # features 6 and 7 of the match
     projected = [100 + 100 * 3 / 10, 50 + 100 * 1 / 10]
@@ -96,10 +96,7 @@ def result(frame: int) -> TrackResult:
 
 
 def told(frames: list[int]) -> LoopPictureRecorder:
-    """Make a recorder that has seen these keyframes.
-
-    The brightness of each image is the number of its keyframe.
-    """
+    """Make a recorder that has seen these keyframes. The brightness of an image is its number."""
     pictures = LoopPictureRecorder()
     pictures.begin(CAMERA, None)
     for frame in frames:
@@ -123,7 +120,7 @@ def test_a_picture_has_the_images_of_its_two_frames(closed_map: Map) -> None:
     for jpeg, brightness in ((picture.match_jpeg, 3), (picture.query_jpeg, 40)):
         assert decoded(jpeg).shape == (50, 100)
         assert abs(float(decoded(jpeg).mean()) - brightness) < 2
-    # The centre of the first pixel is at 0, so that the centre of pixel 10 is at 4.75 in the half.
+    # The centre of the first pixel is at 0. Therefore, pixel 10 is at 4.75 at half resolution.
     np.testing.assert_allclose(picture.query_xy[0], [4.75, 9.75])
     assert len(picture.query_xy) == len(picture.match_xy) == 3
 
@@ -160,7 +157,7 @@ def greenness(image: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 def test_a_match_is_a_dot_in_either_image_and_a_line() -> None:
     green = greenness(decoded(draw_picture(picture_of([[50.0, 60.0]]))))
-    assert green.shape == (320, 1288)  # 640 for each image, twice the size, and what parts them
+    assert green.shape == (320, 1288)  # two images of 640 columns at twice the size, and a gap
     left, right = (101, 121), (2 * 150 + 1 + 648, 2 * 90 + 1)
     middle = ((left[0] + right[0]) // 2, (left[1] + right[1]) // 2)
     for x, y in (left, right):

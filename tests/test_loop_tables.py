@@ -38,10 +38,7 @@ def score(data: str, detector: str, ap: float, sequence: float | None) -> Score:
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the tables of two detectors, on a town and on KITTI.
-
-    Only KITTI has an order.
-    """
+    """The tables of two detectors, on a town and on KITTI. Only KITTI has an order."""
     online = OnlineScore(
         data="kitti00", detector="bow", window="20 s", verified_by="orb", images=10, answerable=4,
         right=3, near=1, far=0, recall_at_100_precision=0.5, recall_at_100_precision_far=0.75,

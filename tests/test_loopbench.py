@@ -104,7 +104,8 @@ def test_a_turned_camera_sees_in_its_middle_what_was_aside():
     image[:, column - 2 : column + 3] = 255
     bright = np.flatnonzero(turned(image, 15.0)[100] > 128)
     assert bright.mean() == pytest.approx(400, abs=1)
-    assert (turned(np.full_like(image, 90), 30.0)[:, -200:] == 0).mean() > 0.9  # not seen before
+    # Outside the original image.
+    assert (turned(np.full_like(image, 90), 30.0)[:, -200:] == 0).mean() > 0.9
 
 
 def test_conditions_repeat_with_their_seed_and_leave_the_rest_alone():
@@ -135,7 +136,8 @@ def test_a_drive_asks_for_what_lies_long_before(tmp_path):
     assert asked.relation.shape == (10, 10)
     same = np.argwhere(asked.relation == SAME)
     assert same.tolist() == [[5, 2]]
-    assert (asked.relation[0, 1:] == UNKNOWN).all()  # image 50 does not ask for image 1 and later
+    # Image 50 is not compared with image 1 and later images.
+    assert (asked.relation[0, 1:] == UNKNOWN).all()
     assert asked.relation[9, 0] == DIFFERENT
     assert found.query_set(Condition("change", 1.0), 0) is None
     assert asked.in_order
@@ -209,7 +211,7 @@ def test_figures_of_detectors_that_know_and_that_err(vocabulary):
     assert sage.verified == {name: Verified(right=1.0, wrong=0) for name in names}
     assert liar.accuracy == {"0.5": 0.0, "0.9": 0.0}
     assert liar.accepted == (0.0, 0.0)
-    # The liar's best images show other walls, whose matches obey no one geometry.
+    # The best images of the inverted detector show other walls, so that verification fails.
     assert liar.first_right == 0.0
     assert liar.verified == {name: Verified(right=0.0, wrong=0) for name in names}
     (gain,) = gains
@@ -226,14 +228,14 @@ def test_a_sequence_is_the_mean_along_the_best_line():
     scores = np.array([[0.3, 0.0, 0.6], [0.0, 0.9, 0.0], [0.6, 0.0, 0.3]])
     found = sequence_scores(scores)
     np.testing.assert_allclose(found[0], scores[0])
-    # Image 0 has no way before it: the mean of query 0 stands for it.
+    # There is no image before image 0. It is replaced with the mean of query 0.
     np.testing.assert_allclose(found[1], [(0.0 + 0.3) / 2, (0.9 + 0.3) / 2, 0.0])
     np.testing.assert_allclose(found[2, 2], (0.3 + 0.9 + 0.3) / 3)
 
 
 @pytest.mark.slow
 def test_a_sequence_outvotes_an_image_that_looks_like_all(vocabulary):
-    """The route is driven again, but one gallery image is the most similar image of every query."""
+    """The same route is queried, but one gallery image is the most similar one for every query."""
     n = 30
     relation = np.where(np.eye(n) > 0, SAME, DIFFERENT).astype(np.int8)
     p = np.full((n, n), 0.1) + 0.6 * np.eye(n)
@@ -249,7 +251,7 @@ def test_a_sequence_outvotes_an_image_that_looks_like_all(vocabulary):
         found[in_order] = cell.sequence_right
     assert found[True] > 0.8
     assert found[False] is None
-    # Driven the other way the images come in no such order.
+    # In the opposite direction, the images have a different order.
     backwards = sequence_scores(log_odds(p[::-1])).argmax(1)[LENGTH:]
     assert (backwards == np.arange(n)[::-1][LENGTH:]).mean() < 0.2
 
@@ -259,7 +261,7 @@ def test_what_is_made_of_images_asked_for_is_kept_while_they_are_asked_for(vocab
     detectors = DetectorSet([told], vocabulary, 1)
     galleries = [[texture(k), texture(k + 1)] for k in range(5)]
     views, _ = detectors.gallery(galleries[0])
-    for k in (0, 1, 2, 0, 3):  # one with others of its own between
+    for k in (0, 1, 2, 0, 3):  # a set with a different gallery in between
         detectors.gallery([image.copy() for image in galleries[k]])
     assert detectors.gallery(galleries[0])[0] is views
     assert len(told.stored) == 4

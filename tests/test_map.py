@@ -234,7 +234,7 @@ def test_a_culled_keyframe_follows_its_parent(check_map):
     a = map_.arrays
     poses = a.T_cw[:6].copy()
     map_.cull_keyframe(3)
-    map_.cull_keyframe(2)  # the parent of a culled one: keyframe 3 hangs on 1 through 2
+    map_.cull_keyframe(2)  # the parent of a culled keyframe, so that 3 depends on 1 through 2
     np.testing.assert_allclose(map_.keyframe_pose(3), poses[3], rtol=0, atol=1e-12)
     assert map_.parents[4] == 1
     assert map_.living_keyframes().tolist() == [0, 1, 4, 5]
@@ -257,10 +257,7 @@ def test_pose_of_a_keyframe_is_a_copy():
 
 @pytest.mark.slow
 def test_a_long_chain_of_culled_keyframes_still_has_poses():
-    """If the camera stands still, thousands of keyframes are culled.
-
-    Each is the parent of the next.
-    """
+    """If the camera stands still, thousands of keyframes are culled."""
     rng = np.random.default_rng(0)
     map_ = Map(SCALES)
     for _ in range(1500):
@@ -402,7 +399,7 @@ def test_grows_to_5000_keyframes_and_a_million_landmarks_in_bounded_memory():
     assert capacity_landmarks <= 1.5 * 1_000_000 + 200
     assert held < 1.1 * sum(sizes.values()) + 5e6
     assert peak < 2.0 * held
-    # Geometric growth: as many copies as log 1.5, not one for each keyframe.
+    # The number of copies grows with the logarithm of the size, not with each keyframe.
     assert len(seen_arrays) <= 1 + np.ceil(np.log(1_000_000 / 8192) / np.log(1.5))
 
 

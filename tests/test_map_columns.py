@@ -29,11 +29,11 @@ from vslam.maps.stored_map import StoredMap, appended, selected
 
 CAMERA = Camera(fx=100.0, fy=100.0, cx=50.0, cy=50.0, width=100, height=100, baseline=0.5)
 N, PER = 7, 4  # keyframes, and keypoints of each
-# Columns that tell how keyframes, landmarks and rows belong together, which are numbered anew when
-# some are selected.
+# Columns that link keyframes, landmarks and rows. They are renumbered when a part of the map is
+# selected.
 FAMILY = {"parent", "restart"}
 LINKS = {"first_row", "first_keyframe", "keyframe", "landmark", "next_row", "head"}
-# Columns that cannot hold just any number.
+# Columns in which not every number is valid.
 RESTRICTED = FAMILY | LINKS | {
     "T_cw", "T_c_parent", "octave", "keyframe_alive", "landmark_alive", "merged_into",
     "n_observations",
@@ -87,7 +87,7 @@ def test_a_copy_holds_all_and_shares_nothing(map_):
 
 
 def test_growing_keeps_all(map_):
-    before, grown = map_.columns(), map_.copy()  # the copy has no room for another one
+    before, grown = map_.columns(), map_.copy()  # the copy has no spare capacity
     grown.add_keyframe(Features.none(), np.eye(4), 0.0, 0)
     grown.add_landmarks(np.zeros((1, 3)), np.zeros((1, 4), np.uint64), N)
     assert len(grown.timestamps) == N + 1

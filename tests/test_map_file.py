@@ -32,7 +32,6 @@ CONFIG = Config()
 
 
 def driven(slam: Slam, ring: Ring, places, start: float = 0.0) -> Slam:
-    """Drive along the ring at ten frames per second."""
     for i, k in enumerate(places):
         slam.step_features(Extracted(ring.see(k, seed=int(start))), start + 0.1 * i)
     slam.finish()
@@ -107,7 +106,7 @@ def test_all_of_a_map_comes_back(slam, file, check_map):
         old, new = before.rows(keyframes[k]), after.rows(k)
         for name in ("xy", "u_right", "octave", "angle", "descriptor"):
             assert np.array_equal(getattr(a, name)[old], getattr(b, name)[new], equal_nan=True)
-        # Both see the same points from there, each of them with all that is known of it.
+        # Both maps see the same points, with the same data.
         ids, same = a.landmark[old], b.landmark[new]
         assert np.array_equal(ids >= 0, same >= 0)
         ids, same = ids[ids >= 0], same[same >= 0]
@@ -172,10 +171,7 @@ def test_loops_images_drives_and_world_come_back(slam, tmp_path):
 
 
 def test_what_the_detector_knew_comes_back(slam, file, ring):
-    """The detector finds the same candidates with the same scores.
-
-    It need not look up the words again.
-    """
+    """The candidates have the same scores, and the words need not be looked up again."""
     again = create_detector("bow", CONFIG)
     stored = load_map(file)
     again.restore(stored.detector)
@@ -211,7 +207,7 @@ def test_descriptors_and_images_of_learned_detectors_come_back(tmp_path):
     for k in range(4):
         map_.add_keyframe(Features.none(), np.eye(4), float(k), k)
         map_.parents[k] = k - 1
-        # The second keyframe is culled, the last one was kept without its image.
+        # The second keyframe is culled. The image of the last one was not kept.
         picture = pictures[min(k, 2)] if k < 3 else None
         detector.add(k, picture, Features.none())
         if picture is not None:
@@ -236,7 +232,7 @@ def test_descriptors_and_images_of_learned_detectors_come_back(tmp_path):
     values[:2] = 0
     with pytest.raises(ValueError, match="keyframe 0 is not a JPEG"):
         create()[1].restore(replace(found.images, values=values), 640)
-    seen = again.memory()  # by the network, as a lost frame was looked for
+    seen = again.memory()  # as if a lost frame had been searched for with the network
     table = seen.tables["capsule/descriptors"]
     assert len(table.values) == 2
     other = replace(table, values=np.full_like(table.values, np.nan))
@@ -287,7 +283,7 @@ def test_flipped_bytes_never_load_as_another_map(file, tmp_path):
         damaged[position] ^= 1 << int(rng.integers(8))
         path = tmp_path / "flipped.npz"
         path.write_bytes(damaged)
-        with suppress(InputError):  # else it was in what a zip file says twice
+        with suppress(InputError):  # otherwise, the damaged bytes are redundant in a zip file
             found = load_map(path).map.arrays
             assert np.array_equal(found.xyz, same.xyz)
             assert np.array_equal(found.T_cw, same.T_cw)

@@ -40,10 +40,7 @@ def ring() -> Ring:
 
 @pytest.fixture(scope="module")
 def drives(ring) -> list[StoredMap]:
-    """Three drives: the first meets the third, and the third meets the second.
-
-    Each drive has its own world frame.
-    """
+    """Three drives with their own world frames. The third one overlaps with both others."""
     parts = (range(80), range(110, 180), range(55, 130))
     return [driven(ring, part, seed) for seed, part in enumerate(parts)]
 
@@ -62,10 +59,7 @@ def frames_of(drives: list[StoredMap], starts: list[int]) -> list[np.ndarray]:
 
 
 def errors(map_, ring: Ring, starts: list[int]) -> np.ndarray:
-    """Return how far each keyframe is from its true position, in metres.
-
-    Positions are in the world of the first drive.
-    """
+    """Return the position error of each keyframe in metres, in the world of the first drive."""
     places = [starts[s] + f for s, f in zip(map_.sessions, map_.frames, strict=True)]
     true = np.array([inverse(ring.pose(starts[0])) @ ring.pose(k) for k in places])
     T_wc = inverses(map_.arrays.T_cw[: map_.n_keyframes])
@@ -86,7 +80,7 @@ def test_an_appended_map_is_as_it_was(drives, check_map):
     assert np.array_equal(words.of(n + k), other.detector.tables["words"].of(k))
     assert both.map.sessions.tolist() == [0] * n + [1] * other.map.n_keyframes
     assert both.drives == ("ring 0", "ring 110")
-    # Each is in a part of its own until a loop joins them.
+    # Each drive is a separate part until a loop joins them.
     assert np.unique(both.map.submaps()).tolist() == [0, n]
 
 
@@ -113,7 +107,7 @@ def test_drives_that_meet_become_one_map(drives, ring, check_map, tmp_path):
     assert any({0, 1} <= seen | {sessions[k]} for k, seen in enumerate(shared))
     assert any({1, 2} <= seen | {sessions[k]} for k, seen in enumerate(shared))
 
-    # It is a map like any other: a camera is found in the parts of all three, or goes on in it.
+    # In the merged map, a camera can be relocalised in all three parts.
     save_map(tmp_path / "town.npz", merged.stored)
     for place in (10, 90, 170):
         slam = Slam.load(tmp_path / "town.npz", threads=1, localize=True)
@@ -235,7 +229,7 @@ def test_a_merged_map_is_exported(drives, tmp_path):
     ids = [line.split()[1] for line in lines if line.startswith("VERTEX")]
     assert ids == [str(k) for k in range(merged.map.n_keyframes)]
     assert (tmp_path / "town.ply").stat().st_size > 0
-    # The edges are weighted by the thresholds that the map was made with.
+    # The edges are weighted by the thresholds with which the map was made.
     drifting = replace(merged, thresholds={"pose_graph.rotation_drift": 0.1})
     save_map(tmp_path / "drifting.npz", drifting)
     result = run("export", "g2o", tmp_path / "drifting.npz")

@@ -30,12 +30,12 @@ from vslam.workers import Workers
 
 POINTS = Points.create()
 RING = ring.Ring.create(zoom=True)
-# A job runs as late as can be, where its result is needed, or as early as can be, at once.
+# A job runs either as late as possible (when its result is needed) or at once.
 late_and_early = pytest.mark.parametrize(
     "workers", [lambda: Workers(1), InstantWorkers], ids=["late", "early"]
 )
 
-AT_THE_END = -1  # in place of a keyframe
+AT_THE_END = -1  # instead of the number of a keyframe
 
 
 class Closing:
@@ -80,7 +80,7 @@ def see_points(k: int) -> Features:
 
 
 def at(k: int) -> np.ndarray:
-    """Return ``T_cw`` of a camera that drives ahead by 0.2 m per frame."""
+    """Return ``T_cw`` of a camera that moves ahead by 0.2 m per frame."""
     return ahead(0.2 * k, 0.002 * k)
 
 
@@ -109,7 +109,7 @@ class Drive:
         self._see, self._at = see, poses
 
     def next_frame(self) -> Frame:
-        """Return the next frame at its true pose. It is tracked in the mapper's view of the map."""
+        """Return the next frame at its true pose, tracked in the mapper's view of the map."""
         k, mapper = len(self.mapper.frames), self.mapper
         frame = frame_of(self._see(k), k, 0.1 * k, camera=self.context.camera)
         frame.T_cw = self._at(k)
@@ -139,7 +139,6 @@ class Drive:
 
 
 def bytes_of_view(view: MapView) -> bytes:
-    """Return everything that a view of the map shows, as bytes."""
     values = (getattr(view, field.name) for field in fields(view))
     arrays = (x for value in values for x in (value if isinstance(value, tuple) else (value,)))
     return b"".join(np.ascontiguousarray(x).tobytes() for x in arrays)
@@ -179,7 +178,7 @@ def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(workers, aft
     assert mapper.view is not shown
     assert len(mapper.view.local_landmarks.ids) > len(
         shown.local_landmarks.ids
-    )  # two keyframes triangulate
+    )  # with two keyframes, landmarks are triangulated
     merged = mapper.view
     drive.step()
     assert mapper.view is merged
@@ -209,14 +208,13 @@ def test_a_keyframe_merges_the_one_before():
     assert processed == [0]
     drive.step(keyframe=True)
     assert processed == [0, 1]
-    assert not drive.mapper.is_merged  # the new one is not, though
+    assert not drive.mapper.is_merged  # the new keyframe is not merged
 
 
 def trace_on_the_ring(workers, look: Callable[[Mapper], object] = lambda mapper: None) -> list:
-    """Drive on the ring with noisy features.
+    """Return what tracking sees at each frame of the ring, and the final map.
 
-    Returns what tracking sees at each frame, and the final map. ``look`` is called after each
-    frame.
+    The features are noisy. ``look`` is called after each frame.
     """
     drive = Drive(
         workers,
@@ -234,7 +232,7 @@ def trace_on_the_ring(workers, look: Callable[[Mapper], object] = lambda mapper:
         seen.append((counts, bytes_of_view(mapper.view), np.array(poses).tobytes()))
         look(mapper)
     drive.mapper.finish()
-    assert len({view for _, view, _ in seen}) == 10  # each keyframe and each merge changes it
+    assert len({view for _, view, _ in seen}) == 10  # each keyframe and each merge changes the view
     trajectory = drive.mapper.trajectory().T_wc.tobytes()
     return [*seen, bytes_of_map(drive.mapper.map), trajectory]
 
@@ -260,7 +258,7 @@ def test_completing_shows_tracking_nothing(workers):
     assert (mapper.is_merged, mapper.is_mapping) == (False, False)
     assert mapper.view is shown
     assert [(frame.T_cw.tobytes(), frame.landmark.tobytes()) for frame in held] == before
-    assert mapper.complete() is map_  # and again
+    assert mapper.complete() is map_  # the second call returns the same map
     mapper.merge()
     assert mapper.view is not shown
 
@@ -272,7 +270,7 @@ def test_the_map_is_not_to_be_had_while_a_keyframe_is_mapped(workers):
     for use in (lambda: drive.mapper.map, drive.mapper.trajectory):
         with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
             use()
-    # Frames are placed by the reference keyframe, which is known; others may be moving.
+    # Frames are placed by the reference keyframe. Other keyframes may be moving.
     np.testing.assert_array_equal(drive.mapper.keyframe_pose(1), drive.mapper.view.T_reference)
     with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
         drive.mapper.keyframe_pose(0)
@@ -317,10 +315,7 @@ MOVES = [se3_exp(np.array(twist)) for twist in ([0.3, 0, 0, 0, 0.02, 0], [0, 0, 
 
 @late_and_early
 def test_held_frames_follow_a_merge(workers):
-    """A placed frame follows its keyframe.
-
-    A frame that is not placed follows the reference keyframe.
-    """
+    """A frame that is not placed follows the reference keyframe."""
 
     def move(map_: Map, keyframe: int) -> None:
         for k in range(keyframe + 1 if keyframe else 0):
@@ -386,7 +381,6 @@ def monocular_drive(workers, closing: Closing) -> Drive:
 
 
 def begin_with_two_views(drive: Drive) -> None:
-    """Begin the map with the frames 0 and 3."""
     frames = []
     for _ in range(4):
         frames.append(drive.next_frame())
@@ -414,7 +408,6 @@ def test_a_monocular_map_begins_with_two_keyframes():
 
 
 def drive_twist(k: int) -> np.ndarray:
-    """Return the ``(6,)`` twist from frame 0 to frame k."""
     return np.array([0.0, 0.0, -0.2 * k, 0.0, -0.002 * k, 0.0])
 
 
@@ -442,15 +435,15 @@ def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_
         np.testing.assert_allclose(frame.T_cw[:3, 3], 2.0 * before[:3, 3], atol=2e-3)
         np.testing.assert_allclose(frame.T_cw[:3, :3], before[:3, :3], atol=1e-4)
     drive.mapper.hold(*held)
-    drive.mapper.finish()  # nothing more has changed
+    drive.mapper.finish()  # finish has changed nothing
     np.testing.assert_allclose(held[0].twist, [2, 4, 6, 4, 5, 6])
 
 
 @pytest.mark.parametrize("adjusting", [False, True])
 def test_where_culled_landmarks_are_dropped_frames_track_the_same_points(adjusting, monkeypatch):
-    """Culled landmarks are not dropped during a global bundle adjustment.
+    """Global bundle adjustment refers to landmarks by their numbers.
 
-    It refers to landmarks by their numbers.
+    Therefore, culled landmarks are not dropped while it runs.
     """
 
     def kill(map_: Map, keyframe: int) -> None:
@@ -500,7 +493,7 @@ def test_the_reference_can_be_the_keyframe_that_shares_the_most_with_a_frame():
     other = np.isin(frame.landmark, mapper.map.landmarks_of(1))
     frame.landmark[other], frame.xyz[other] = -1, np.nan
     mapper.refer_to_nearest(frame)
-    assert mapper.reference == 1  # the frame shares none with any
+    assert mapper.reference == 1  # the frame shares no landmark with any keyframe
     frame.landmark[:] = -1
     frame.landmark[:20] = np.setdiff1d(mapper.map.landmarks_of(0), mapper.map.landmarks_of(1))[:20]
     mapper.refer_to_nearest(frame)
@@ -524,10 +517,7 @@ def test_a_place_is_old_when_its_keyframe_is(known_after_s, known):
 
 @pytest.mark.parametrize("is_due", [False, True])
 def test_an_old_keyframe_can_serve_in_place_of_a_new_one(is_due):
-    """The old keyframe also counts for the merge of a global bundle adjustment.
-
-    If its result is due, it is merged as with a new keyframe.
-    """
+    """It also counts for the merge of a global bundle adjustment whose result is due."""
     drive = Drive(known_after_s=0.3)
     drive.steps([0, 3], 6)
     mapper, frame = drive.mapper, drive.last
@@ -541,7 +531,7 @@ def test_an_old_keyframe_can_serve_in_place_of_a_new_one(is_due):
     assert (mapper.is_mapping, mapper.is_merged) == (is_due, not is_due)
     drive.step()
     assert drive.closing.finished == 0
-    drive.step()  # two frames after
+    drive.step()  # two frames later
     assert drive.closing.finished == is_due
     assert mapper.is_merged
 
@@ -550,12 +540,12 @@ def test_far_points_are_mapped_of_the_first_keyframe_while_it_is_the_only_one():
     drive = Drive()
     frame = drive.step(keyframe=True)
     near, n = drive.mapper.view, np.count_nonzero(frame.landmark >= 0)
-    assert not drive.mapper.map_far_points(drive.next_frame())  # another frame
+    assert not drive.mapper.map_far_points(drive.next_frame())  # not the frame of the keyframe
     assert drive.mapper.map_far_points(frame)
     assert n < np.count_nonzero(frame.landmark >= 0) == 240
     assert len(drive.mapper.view.local_landmarks.ids) == 240 > len(near.local_landmarks.ids)
     assert np.isfinite(frame.xyz).all()
-    assert not drive.mapper.map_far_points(frame)  # there are no more
+    assert not drive.mapper.map_far_points(frame)  # there are no more far points
     drive = Drive()
     first = drive.step(keyframe=True)
     second = drive.step(keyframe=True)
@@ -570,7 +560,7 @@ INCOMPLETE = r"^mapping [^.]*failed [^.]*incomplete; continue from a map that wa
 
 
 class BrokenError(Exception):
-    """The error that a failing mapping job raises in these tests."""
+    """The error of a mapping job."""
 
 
 def fail(map_: Map, keyframe: int) -> None:
@@ -680,8 +670,6 @@ def test_a_map_that_is_incomplete_is_not_saved(failing, threads, tmp_path, monke
 
 def test_a_detector_that_fails_costs_its_loops_alone(tmp_path, caplog):
     class Detector(NoDetector):
-        """A detector that fails at each keyframe."""
-
         def add(self, keyframe, image, features):
             raise BrokenError
 
@@ -703,10 +691,7 @@ def test_a_detector_that_fails_costs_its_loops_alone(tmp_path, caplog):
 
 
 def test_a_mapper_that_is_restored_goes_on_as_the_one_that_was_not():
-    """The reference keyframe is not the newest keyframe.
-
-    This happens after a frame was relocalised in the map.
-    """
+    """The reference keyframe is not the newest one, as after relocalisation."""
     one = Drive()
     one.steps([0, 3], 6)
     one.mapper.append_pose(one.next_frame(), tracked=True, near=0)

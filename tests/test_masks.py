@@ -1,7 +1,4 @@
-"""Masked pixels give no feature, no patch and no place.
-
-Runs without masks have no additional cost.
-"""
+"""Masked pixels give no feature, no patch and no place. Runs without masks are not slower."""
 
 from __future__ import annotations
 
@@ -34,7 +31,6 @@ HOOD = 110  # first row that the hood covers
 
 @pytest.fixture(scope="module")
 def mask(corridor) -> np.ndarray:
-    """A mask that is white above the hood and black on the hood."""
     mask = np.full(corridor.left[0].shape, 255, np.uint8)
     mask[HOOD:] = 0
     return mask
@@ -303,7 +299,7 @@ def test_report_and_doctor_show_the_mask(call, kitti_tree, mask, tmp_path):
     report = (tmp_path / "runs" / "latest" / "report.md").read_text()
     assert re.search(rf"\| mask +\| {re.escape(str(path))} +\|", report)
     assert json.loads((tmp_path / "runs/latest/run.json").read_text())["mask"] == str(path)
-    path.rename(tmp_path / "moved.png")  # exports show the whole images
+    path.rename(tmp_path / "moved.png")  # exports use the images without the mask
     assert open_images(read_run("runs/latest")).stored[0].mask is None
     path = tmp_path / "moved.png"
     code, out, _ = call("doctor", "--data", kitti_tree, "--mask", path)

@@ -25,7 +25,6 @@ def random_descriptors(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def with_flips(rng: np.random.Generator, descriptors: np.ndarray, bits: int) -> np.ndarray:
-    """Return copies of descriptors with ``bits`` random bits flipped in each."""
     flat = np.unpackbits(descriptors.view(np.uint8), axis=1)
     for row in flat:
         row[rng.choice(256, bits, replace=False)] ^= 1
@@ -128,7 +127,7 @@ def scene(seed: int, *, octaves: int = 8, n: int = 400, m: int = 300) -> dict:
     rng = np.random.default_rng(seed)
     xy = rng.uniform([0, 0], [WIDTH, HEIGHT], (n, 2)).astype(np.float32)
     frame_descriptors = random_descriptors(rng, n)
-    # Neighbours that resemble each other put the ratio test to work.
+    # Similar neighbours exercise the ratio test.
     frame_descriptors[1::4] = with_flips(rng, frame_descriptors[::4], 30)
     xy[1::4] = xy[::4] + rng.uniform(-4, 4, (n // 4, 2))
     octave = rng.integers(0, octaves, n).astype(np.uint8)

@@ -1,8 +1,8 @@
 """The version of the method changes whenever the trajectory of a reference clip changes.
 
-There are three reference clips: a corridor with stereo, the same corridor with RGB-D, and a drive
-round a block whose loop is closed by night. After a change of the method, raise ``METHOD_VERSION``
-in ``vslam/method.py`` and write the references again with ``make method``.
+There are three reference clips: a stereo corridor, the same corridor as RGB-D, and a drive round a
+block whose loop is closed by night. After a change of the method, raise ``METHOD_VERSION`` in
+``vslam/method.py`` and write the references again with ``make method``.
 """
 
 from __future__ import annotations

@@ -37,10 +37,7 @@ class Building(Drive):
         return drive
 
     def placed_frame(self, *, tracked: bool = True) -> Frame:
-        """Return the next frame after it is placed.
-
-        A frame that is not tracked has no landmarks.
-        """
+        """Return the next frame after it is placed. If it is not tracked, it has no landmarks."""
         frame = self.next_frame()
         if not tracked:
             frame.landmark[:], frame.xyz[:] = -1, np.nan
@@ -65,10 +62,7 @@ def found(frame: Frame) -> Found:
 
 
 def test_localising_leaves_the_map_alone():
-    """The map is byte-identical afterwards.
-
-    This includes the counts of how often landmarks were seen.
-    """
+    """The map is byte-identical, including the counts of how often landmarks were seen."""
     drive = Building.with_a_map()
     mapper, mode = drive.mapper, Mode(drive.mapper)
     lost, tracked = drive.lost_frame(10), drive.placed_frame()
@@ -123,7 +117,7 @@ def test_a_frame_with_too_few_depths_begins_none():
 def test_a_monocular_map_begins_with_the_second_view():
     drive = Building(CAMERA.left_camera())
     assert not drive.mode.begin(drive.placed_frame())
-    assert drive.mode.state() is None  # the first view is not kept in a file
+    assert drive.mode.state() is None  # the first view is not saved
     for _ in range(20):
         second = drive.placed_frame(tracked=False)
         if drive.mode.begin(second):
@@ -137,10 +131,7 @@ def test_a_monocular_map_begins_with_the_second_view():
 
 @pytest.mark.parametrize("twist", [TWIST, None])
 def test_a_sub_map_is_placed_by_the_prediction_if_the_speed_is_known(twist):
-    """The frame tracks no landmark of the previous map.
-
-    It may have tracked some when it was lost.
-    """
+    """The frame tracks no landmark of the previous map, but may have tracked some before."""
     drive = Building.with_a_map()
     drive.tracker.resume(twist)
     frame = drive.placed_frame()
@@ -154,10 +145,7 @@ def test_a_sub_map_is_placed_by_the_prediction_if_the_speed_is_known(twist):
 
 @pytest.mark.parametrize(("young_keyframes", "patience"), [(2, 1), (1, 3)])
 def test_a_lost_stereo_camera_begins_a_sub_map_sooner_in_a_young_map(young_keyframes, patience):
-    """A map with two keyframes is young.
-
-    There, a sub-map begins after one lost frame. Otherwise, it begins after three.
-    """
+    """A young map (two keyframes) waits for one lost frame, and an older map for three."""
     drive = Building.with_a_map(tracking={"young_keyframes": young_keyframes})
     for n in range(1, patience + 1):
         begun = drive.mode.begin_after_loss(drive.lost_frame(1))
@@ -173,7 +161,7 @@ def test_a_lost_monocular_camera_looks_for_a_first_view_after_four_frames():
         assert not drive.mode.begin_after_loss(drive.lost_frame(1))
         assert drive.mode.state() is not None
     assert not drive.mode.begin_after_loss(drive.lost_frame(1))
-    assert drive.mode.state() is None  # a view waits
+    assert drive.mode.state() is None  # a view waits for the second one
 
 
 # -- more of a young map --------------------------------------------------------------------------
@@ -181,17 +169,17 @@ def test_a_lost_monocular_camera_looks_for_a_first_view_after_four_frames():
 
 def test_a_frame_that_is_lost_right_after_a_map_began_may_see_more_of_it():
     drive = Building()
-    assert not drive.mode.map_far_points()  # of what?
+    assert not drive.mode.map_far_points()  # there is no keyframe
     first = drive.placed_frame()
     drive.mode.begin(first)
     shown = len(drive.mapper.view.local_landmarks.ids)
     first.twist = TWIST
-    assert not drive.mode.map_far_points()  # the camera was tracked since then
+    assert not drive.mode.map_far_points()  # a later frame was tracked
     assert len(drive.mapper.view.local_landmarks.ids) == shown
     first.twist = None
     assert drive.mode.map_far_points()
     assert len(drive.mapper.view.local_landmarks.ids) == 240 > shown
-    assert not drive.mode.map_far_points()  # there is no more
+    assert not drive.mode.map_far_points()  # there are no more far points
 
 
 def test_a_monocular_map_has_no_far_points_to_show():
@@ -230,7 +218,7 @@ def test_a_frame_becomes_a_keyframe_when_it_is_time():
     for _ in range(3):
         frame = drive.placed_frame()
         made.append(drive.mode.update_map(frame, found(frame)))
-    assert made == [False, False, True]  # frames 6, 7 and 8; the keyframe before is 3
+    assert made == [False, False, True]  # frames 6, 7 and 8; the previous keyframe is frame 3
     assert drive.mapper.last_frame == 8
     assert drive.mode.state().gain_awaited
     assert not drive.mapper.is_merged

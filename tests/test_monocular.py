@@ -44,7 +44,6 @@ def run(frames, detector="none", *, threads=1, dark=()):
 
 
 def error(slam, frames, chosen=slice(None)):
-    """Return the ATE RMSE in metres after Sim3 alignment."""
     found = slam.trajectory()
     truth = Trajectory(found.timestamps, np.array([RING.pose(k) for k in frames]))
     indices = np.arange(len(frames))[chosen]

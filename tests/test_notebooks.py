@@ -12,11 +12,11 @@ pytestmark = pytest.mark.slow
 nbformat = pytest.importorskip("nbformat")
 nbclient = pytest.importorskip("nbclient")
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "docs" / "notebooks").glob("*.ipynb"))
-FRAMES = 16  # in place of 40: rendering them is most of the time
+FRAMES = 16  # instead of 40, because rendering takes most of the time
 
 
 def executed(path: Path):
-    """The notebook after it was executed on few frames."""
+    """Return the notebook after it was executed on few frames."""
     notebook = nbformat.read(path, as_version=4)
     for cell in notebook.cells:
         if cell.cell_type == "code":
@@ -58,5 +58,6 @@ def test_detectors_compared():
         for name, values in re.findall(r"'([\w-]+)': \[([\d., ]+)\]", outputs(notebook))
     }
     assert shares.keys() == {"bow", "capsule"}
-    assert all(values[0] == 1.0 for values in shares.values())  # unchanged images find themselves
+    # Unchanged images are identical to the gallery.
+    assert all(values[0] == 1.0 for values in shares.values())
     assert pictures(notebook) == 1

@@ -53,7 +53,7 @@ def test_the_adjoint_carries_a_small_motion_to_the_other_side_of_a_pose():
 @pytest.mark.parametrize("kind", ["mono", "mixed", "stereo"])
 @pytest.mark.parametrize("believed", [0.7, 1.0])
 def test_errors_of_a_pose_are_those_that_its_covariance_predicts(kind, believed):
-    """The covariance is also right if the observations are more accurate than their weights assume.
+    """The covariance is also right if observations are more accurate than their weights assume.
 
     If they are as accurate as assumed, one observation in twenty fails the test for inliers. This
     reduces the residuals of the others. The variance of a gradient that is estimated from few cells
@@ -70,10 +70,9 @@ def test_errors_of_a_pose_are_those_that_its_covariance_predicts(kind, believed)
 
 
 def test_the_covariance_holds_where_errors_are_unequal_and_neighbours_share_them():
-    """Near points have errors that are three times as large.
+    """Near points have errors that are three times as large. Every corner is observed four times.
 
-    Every corner is observed four times. A covariance that is computed from the weights alone would
-    be several times too small.
+    A covariance that is computed from the weights alone would be several times too small.
     """
     squared = []
     for seed in range(100):
@@ -91,7 +90,7 @@ def test_the_covariance_holds_where_errors_are_unequal_and_neighbours_share_them
 
 
 def test_a_wrong_offset_makes_the_motion_too_long_or_too_short():
-    """The landmarks of one frame are computed from disparities that are 0.05 px too large.
+    """Landmarks are computed from disparities that are 0.05 px too large.
 
     The next frame is tracked using its left image.
     """
@@ -114,10 +113,10 @@ def test_a_wrong_offset_makes_the_motion_too_long_or_too_short():
 
 
 def test_the_error_of_the_offset_adds_up_along_a_drive():
-    """The error of the offset is constant.
+    """The error in the offset is constant.
 
-    Its part of the covariance therefore grows with the square of the distance. It cancels if the
-    camera returns.
+    Its part of the covariance grows with the square of the distance, and cancels if the camera
+    returns.
     """
     effect = np.zeros((6, 3))
     effect[:3] = 0.001 * np.eye(3)
@@ -237,7 +236,6 @@ def test_the_tool_finds_covariances_that_promise_too_much(promised):
 
 
 def steps(poses: list[np.ndarray]) -> np.ndarray:
-    """Return the distance from each position to the next one in metres."""
     return np.linalg.norm(np.diff([pose[:3, 3] for pose in poses], axis=0), axis=1)
 
 

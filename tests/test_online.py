@@ -50,8 +50,6 @@ def no_bar(what: str, total: int):
 
 
 class Scores:
-    """A detector that returns the scores that it was given."""
-
     name, probability = "told", False
 
     def __init__(self, scores) -> None:
@@ -64,8 +62,8 @@ class Scores:
         return self._scores
 
 
-# Eight images, a window of two. Images 4 and 5 see again what 0 and 1 saw, 6 what 2 saw, and 7 lies
-# near 3 without being marked.
+# There are eight images and a window of two. Images 4, 5 and 6 show the places of 0, 1 and 2.
+# Image 7 was taken near image 3, but is not marked as the same place.
 RELATION = np.full((8, 8), DIFFERENT, np.int8)
 for pair in ((4, 0), (5, 1), (6, 2), *((k, k) for k in range(8))):
     RELATION[pair] = RELATION[pair[::-1]] = SAME
@@ -75,9 +73,9 @@ SCORES[2, 0] = 0.3  # far
 SCORES[3, 1] = 0.2  # far
 SCORES[4, :3] = 0.9, 0.1, 0.5  # right
 SCORES[5, :4] = 0.4, 0.6, 0.5, 0.5  # right
-SCORES[6, :5] = 0.1, 0.7, 0.4, 0.3, 0.3  # far: image 2, its place, comes second
+SCORES[6, :5] = 0.1, 0.7, 0.4, 0.3, 0.3  # far: the right image 2 has the second highest score
 SCORES[7, :6] = 0.1, 0.1, 0.2, 0.8, 0.2, 0.2  # near
-SCORES[7, 7] = SCORES[6, 6] = 1.0  # themselves, which are not asked
+SCORES[7, 7] = SCORES[6, 6] = 1.0  # an image is not compared with itself
 
 
 def told(window: Window, relation=RELATION, scores=SCORES):
@@ -129,7 +127,7 @@ def test_a_wrong_one_on_top_leaves_no_recall_at_full_precision():
     scores[2, 0] = 5.0
     _, judged = told(parse_window("2"), scores=scores)
     assert recall_at_full_precision(decision_curve(judged)) == 0.0
-    scores[2, 0] = 0.9  # as high as the best right one: no threshold parts them
+    scores[2, 0] = 0.9  # no threshold separates it from the best right match
     _, judged = told(parse_window("2"), scores=scores)
     assert recall_at_full_precision(decision_curve(judged)) == 0.0
 
@@ -156,7 +154,7 @@ def test_windows_of_images_and_of_seconds():
     times = np.array([0.0, 1.0, 1.5, 4.0, 4.0, 9.0])
     assert Window(2, timed=False).searchable(6, times).tolist() == [0, 0, 1, 2, 3, 4]
     assert Window(3, timed=True).searchable(6, times).tolist() == [0, 0, 0, 2, 2, 5]
-    # Without times an image a second: 3 s before image 5 was image 2.
+    # Without times, there is one image per second: image 2 is 3 s before image 5.
     assert Window(3, timed=True).searchable(6, None).tolist() == [0, 0, 0, 1, 2, 3]
     assert (parse_window("20s"), parse_window("200")) == (Window(20, True), Window(200, False))
     assert [str(parse_window(text)) for text in ("1.5s", "7")] == ["1.5 s", "7 images"]
@@ -270,10 +268,7 @@ def texture(seed: int, height: int = 188, width: int = 620) -> np.ndarray:
 
 
 def write_drive(folder, places) -> ImageSource:
-    """Write a drive along textures.
-
-    Each place has a texture, and equal places have the same one.
-    """
+    """Write a drive along textures. Equal places have the same texture."""
     files = []
     for k, place in enumerate(places):
         files.append(folder / f"{k:06d}.png")

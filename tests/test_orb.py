@@ -27,10 +27,7 @@ from vslam.frontend.orb import (
 
 
 def textured(height: int = 240, width: int = 320, seed: int = 0) -> np.ndarray:
-    """Make blocks of random grey values, slightly blurred.
-
-    They have many corners of every strength.
-    """
+    """Make slightly blurred blocks of random grey values, with corners of every strength."""
     rng = np.random.default_rng(seed)
     blocks = rng.uniform(0, 255, (height // 8 + 1, width // 8 + 1))
     image = np.kron(blocks, np.ones((8, 8)))[:height, :width]
@@ -154,8 +151,7 @@ def test_no_two_corners_touch_and_none_is_near_the_border():
 def clustered(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Make an image with 3,000 strong corners in a small area and 300 weak corners elsewhere.
 
-    The strong corners are in a cluster of 60 x 60 px. The weak corners are spread over 640 x 240
-    px.
+    The strong corners are in a cluster of 60 x 60 px. The weak ones are spread over 640 x 240 px.
     """
     rng = np.random.default_rng(seed)
     dense = np.stack([rng.integers(300, 360, 3000), rng.integers(90, 150, 3000)], axis=1)
@@ -185,7 +181,7 @@ def test_spread_does_not_let_a_cluster_of_strong_corners_starve_the_rest():
     x, y, score = clustered()
     strong = score >= 100
     chosen = spread(x, y, score, 640, 240, 200)
-    # By score alone all 200 would lie in the cluster, which is 2.3 % of the image.
+    # By score alone, all 200 would be in the cluster, which is 2.3 % of the image.
     assert np.count_nonzero(strong[chosen]) < 25
     tiles = (y[chosen] // 60) * 10 + x[chosen] // 64
     assert len(np.unique(tiles)) == len(np.unique((y // 60) * 10 + x // 64))
@@ -255,7 +251,7 @@ def test_descriptors_turn_with_the_image():
     turn = np.angle(np.exp(1j * (angles[1] - angles[0])))
     np.testing.assert_allclose(turn, -np.pi / 2, rtol=0, atol=1e-5)
     assert bits_between(*described).max() <= 10
-    # Without steering the descriptors would be strangers.
+    # Without steering, the descriptors would not be similar.
     upright = describe(cv2.GaussianBlur(turned, (7, 7), 2), moved, angles[0], PATTERN)
     assert np.median(bits_between(described[0], upright)) > 60
 
@@ -279,7 +275,7 @@ def test_features_per_level_sum_to_n_when_the_last_level_has_nothing_to_give(n, 
 
 
 def test_levels_smaller_than_a_pixel_hold_no_features():
-    config = OrbConfig(n_levels=16, scale_factor=2.0)  # both are the greatest that are allowed
+    config = OrbConfig(n_levels=16, scale_factor=2.0)  # both have the largest allowed value
     assert len(extract(textured(376, 1241), config).xy) > 100
 
 

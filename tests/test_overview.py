@@ -40,7 +40,6 @@ LAWS = ("none", "brightness:0.5", "brightness:1")
 
 
 def copy_run(source: Path, folder: Path, **changes: object) -> Path:
-    """Write a further run that has the trajectory of ``source``."""
     folder.mkdir(parents=True)
     for name in ("trajectory.tum", "trajectory_kitti.txt", "ground_truth_kitti.txt", "config.json"):
         shutil.copy(source / name, folder)
@@ -108,7 +107,6 @@ def entry(
 
 
 def table_of(report: OverviewJson, title: str) -> Table:
-    """Return the table in a section of the page."""
     (section,) = (one for one in overview_page(report, []).sections if one.title == title)
     (table,) = section.parts
     return table
@@ -230,10 +228,7 @@ def test_too_few_sequences_for_a_test_are_said(written):
 
 
 def test_wilcoxon_pairs_sequences_not_runs():
-    """There are six sequences with three runs each.
-
-    Therefore, n is 6, and p is the smallest value that is possible with 6 pairs.
-    """
+    """There are six sequences with three runs each. p has the smallest value for 6 pairs."""
     assert least_pairs() == 6
     runs = [
         entry(
@@ -288,7 +283,7 @@ def loops(found: int, missed: int, lost: int = 0, rpe: float = 0.02) -> dict[str
 def two_conditions() -> list[RunEntry]:
     """Runs on six sequences.
 
-    ``both`` closes the loop of each sequence under brightness, and ``bow`` closes no loop.
+    Under brightness, ``both`` closes the loop of each sequence, and ``bow`` closes no loop.
     """
     runs = []
     for name in (f"{k:02d}" for k in range(6)):
@@ -315,7 +310,7 @@ def test_a_row_for_each_sequence_and_condition_and_who_wins_over_all(two_conditi
     lost, found, ate, rpe = points.sentences
     assert lost == "Lost frames: bow 6 in 18 runs, both 6 in 18 runs."
     assert found.endswith(": bow found 6 of 18, 0 wrong; both found 18 of 18, 0 wrong.")
-    # Half of what brightness costs: the other condition is a tie.
+    # Half of the difference under brightness, because the other condition is a tie.
     assert ate.startswith(
         "ATE over all conditions, both against bow: both wins. Of 6 sequences, bo"
     )
@@ -332,7 +327,7 @@ def test_the_table_of_a_short_name_fits_a_terminal_of_80_columns(two_conditions,
     assert lines[2].split() == [
         "sequence", "perturbation", *["bow", "both"] * 5,
     ]  # fmt: skip
-    for head in lines[:3]:  # numbers and their headings end in one column
+    for head in lines[:3]:  # numbers are aligned with their headings
         ends = {match.end() for match in re.finditer(r"\S+", lines[4])}
         assert {match.end() for match in re.finditer(r"\S+", head[22:])} <= {e - 22 for e in ends}
     assert "- RPE over all conditions, both against bow: a tie on all 6 sequences." in printed
@@ -403,7 +398,7 @@ def test_what_a_run_does_not_have_is_not_made_up():
     )  # fmt: skip
     assert table.rows[1][2:5] == ("n/a", "n/a", "1.000")
     assert points.sentences[0] == "Lost frames: bow 0 in 1 run, both n/a in 1 run."
-    assert len(points.sentences) == 2  # nothing to compare
+    assert len(points.sentences) == 2  # there is no comparison
 
 
 @pytest.mark.parametrize(("ate", "part"), [(1.0, "cannot differ"), (1.5, "on shorter stretches")])
@@ -584,7 +579,6 @@ def test_a_report_of_an_unknown_town_is_left_out_with_a_note(run_folder: Path, t
 
 @pytest.fixture(scope="module")
 def monocular(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run whose trajectory is right except for its unit, as in a monocular run."""
     folder = copy_run(
         run_folder, tmp_path_factory.mktemp("mono") / "mono", sensor="mono", detector="bow",
         perturb="none", alignment="sim3", ate_rmse_m=0.25,
@@ -696,9 +690,9 @@ page.src = "report.html";
 
 @pytest.mark.slow
 def test_report_in_a_browser_as_wide_as_a_phone(written, tmp_path: Path):
-    """In Chromium at a width of 400 px, all figures are drawn.
+    """At a width of 400 px, all figures are drawn, and nothing is wider than the page.
 
-    Nothing is wider than the page. The page requests nothing from the network.
+    The page makes no network requests.
     """
     chromium()
     served = tmp_path / "served"

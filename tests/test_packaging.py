@@ -35,10 +35,7 @@ def build(source: Path, out: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two wheels that were built from copies in different folders.
-
-    The files have different times.
-    """
+    """Two wheels, built from copies in different folders whose files have different times."""
     root = tmp_path_factory.mktemp("wheels")
     made = []
     for number in range(2):
@@ -194,7 +191,7 @@ def test_the_image_is_not_root_and_copies_what_exists():
     known = {o for p in get_command(app).commands["run"].params for o in p.opts}  # type: ignore[attr-defined]
     assert {word for word in command.split() if word.startswith("--")} <= known
     (compiling,) = (rest for word, rest in steps if word == "RUN" and "compile_kernels" in rest)
-    assert "chmod -R a+rwX /cache/*" in compiling  # any --user has to write there
+    assert "chmod -R a+rwX /cache/*" in compiling  # any --user must be able to write there
     for name in re.findall(r"from (vslam\.\S+) import (\w+)", "\n".join(lines)):
         source = ROOT / (name[0].replace(".", "/") + ".py")
         assert f"def {name[1]}(" in source.read_text()

@@ -115,7 +115,7 @@ def test_rows_of_a_table_wider_than_a_phone_become_blocks():
     assert '<td data-label="ATE (m), bow">1.234</td>' in shown(head, row)
     assert "data-label=" not in shown(head[:6], row[:6])
     sentence = ("Words of a sentence. " * 5,)
-    assert "data-label=" not in shown(head[:1], sentence, ("what",))  # it is wrapped
+    assert "data-label=" not in shown(head[:1], sentence, ("what",))  # wide tables are wrapped
     assert "data-label=" in shown(head[:1], sentence)
 
 

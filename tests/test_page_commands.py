@@ -1,9 +1,8 @@
 """Every command on the pages runs, in a shortened form, on the corridor of the tests.
 
-Commands that do not run here are listed with the reason.
-
-Commands are the lines of shell blocks, and those with arguments in tables. The tutorials run in
-``test_site.py``, the pages of plug-ins in ``test_plugins.py``.
+Commands that do not run here are listed with the reason. Commands are the lines of shell blocks,
+and those with arguments in tables. The tutorials run in ``test_site.py``, and the pages of plug-ins
+in ``test_plugins.py``.
 """
 
 from __future__ import annotations
@@ -102,7 +101,7 @@ RULES = {
     ),
     "docs/howto/bench.md": Rules(
         (
-            # All frames: straight ahead alone no error is defined.
+            # All frames are needed, because errors are not defined for a straight path.
             ("vslam bench --out bench/kitti", "vslam bench --seqs 00 --seeds 1 --out bench/kitti"),
             ("synthetic --out", f"synthetic --seqs block --max-frames {N} --perturb none --out"),
             (
@@ -328,10 +327,7 @@ def is_shell(command: str) -> bool:
 
 @pytest.mark.parametrize("path", PAGES, ids=name)
 def test_every_page_with_commands_has_rules(path: Path):
-    """Every page is tested here or in another test.
-
-    The commands that are not run still exist on the page.
-    """
+    """Every page is tested here or in another test. Commands that are not run exist on the page."""
     commands = list(commands_of(path.read_text()))
     if is_elsewhere(path):
         return
@@ -468,10 +464,7 @@ def _depth_sources(desk: Path, corridor) -> None:
 
 
 def _pair_sources(desk: Path, corridor) -> None:
-    """Write images into ``FOLDER``, into two folders, and with depth.
-
-    Also write a video and a bag of stereo pairs.
-    """
+    """Write images into ``FOLDER``, into two folders, and with depth; a video; and a bag."""
     _videos(desk, corridor)
     names = [f"{10**18 + 10**8 * k}.png" for k in range(N)]
     sides = {"LEFT": corridor.left[:N], "RIGHT": corridor.right[:N], "RGB": corridor.left[:N]}
@@ -568,10 +561,9 @@ def run_command(command: str) -> None:
 
 @pytest.fixture
 def dask(desk: Path) -> Iterator[Callable[[str], str]]:
-    """Return a function that starts the commands on the page about clusters.
+    """Return a function that runs the commands on the page about clusters.
 
-    The programs are started on the loopback interface. The function returns the address of the
-    scheduler.
+    It starts the programs on the loopback interface, and returns the address of the scheduler.
     """
     pytest.importorskip("distributed", reason="no dask here: pip install 'vslam[cluster]'")
     log, processes, address = desk / "dask.txt", [], ""

@@ -36,7 +36,6 @@ def coarse(image):
 
 @pytest.fixture(scope="module")
 def points(corridor):
-    """Return the stereo points of the first frame in the world."""
     context = TrackingContext.create(corridor.camera, CONFIG)
     images = FrameImages(corridor.left[FIRST], lambda: corridor.right[FIRST], context)
     features = images.extracted.features
@@ -123,7 +122,8 @@ def test_image_alignment_that_follows_a_moving_object_is_not_believed(corridor, 
 
     def track(pyramid, T_cw, *rest):
         found = track_patches(pyramid, T_cw, *rest)
-        follows = any(T_cw is T for T in misled_poses)  # a third of the patches do not
+        # A third of the patches do not follow the object.
+        follows = any(T_cw is T for T in misled_poses)
         return found._replace(n_matches=len(found.ids) * 3 // 2) if follows else found
 
     slam, results = driven(corridor)
@@ -137,10 +137,7 @@ def test_image_alignment_that_follows_a_moving_object_is_not_believed(corridor, 
 
 
 def run(kitti_tree, threads=1, sequence=None):
-    """Run patch-based tracking over the files of the corridor.
-
-    Reads of the right image are counted.
-    """
+    """Track the corridor by patches. Reads of the right image are counted."""
     sequence = sequence or open_sequence("kitti", kitti_tree, "00")
     reads = []
 

@@ -24,7 +24,7 @@ def walk_of(duration, deviation, rng, jumps=()):
 @pytest.mark.slow
 def test_walk_has_the_stated_deviation_and_correlation_time():
     walk = walk_of(20_000.0, 0.35, np.random.default_rng(0))
-    # 20,000 s hold about 5,000 independent values: the deviation is known to about 1 %.
+    # 20,000 s contain about 5,000 independent values, so that the deviation is known to about 1 %.
     assert walk.std() == pytest.approx(0.35, rel=0.04)
     assert walk.mean() == pytest.approx(0.0, abs=0.02)
     for lag_s in (1.0, 2.0, 4.0):
@@ -73,7 +73,7 @@ def test_brightness_changes_slowly_but_sometimes_jumps():
     )
     steps = np.abs(np.diff(mid))
     assert np.median(steps) < 15
-    # 10 minutes hold about 30 jumps; many of them stand out of what the walk does in 0.1 s.
+    # 10 minutes contain about 30 jumps. Many are larger than the random walk in 0.1 s.
     assert 8 <= (steps > 60).sum() <= 40
 
 

@@ -29,10 +29,7 @@ def texture(seed: int, shape: tuple[int, int] = (160, 480)) -> np.ndarray:
 
 
 def wall(metres: float) -> tuple[np.ndarray, np.ndarray]:
-    """Make a stereo pair that shows a wall, which faces the cameras.
-
-    The distance of the wall is such that its disparity is a whole number.
-    """
+    """Make a stereo pair of a wall that faces the cameras. Its disparity is a whole number."""
     d = CAMERA.bf / metres
     assert d == round(d)
     wide = texture(2)
@@ -69,7 +66,7 @@ def seen(spec: str, images: tuple, index: int = 3, seed: int = 0, drive: Source 
 
 
 def test_at_the_visibility_contrast_is_five_percent():
-    left, right = wall(20.0)  # seen along the axis, in the middle of the image
+    left, right = wall(20.0)  # on the optical axis
     foggy = seen("fog:20", (left, right))
     at = np.s_[60:100, 140:180]
     for clear, hazy in zip((left, right), foggy, strict=True):
@@ -84,7 +81,7 @@ def test_at_the_visibility_contrast_is_five_percent():
 
 def test_fog_takes_the_depth_image_where_there_is_one():
     depth = np.full((160, 320), 12.0, np.float32)
-    depth[:, :100] = 0.0  # unknown: far
+    depth[:, :100] = 0.0  # unknown depth counts as far
     camera = Camera(400.0, 400.0, 160.0, 80.0, 0.5, 320, 160, depth=True)
     left, _ = wall(20.0)
     foggy, same = seen("fog:12", (left, depth), drive=drive_of(camera))
@@ -144,7 +141,7 @@ def test_dark_lowers_gain_and_gamma_in_turn():
     levels = np.array([seen(f"dark:{level}", (ramp, None))[0][0] for level in range(13)], float)
     np.testing.assert_array_equal(levels[0], ramp[0])
     np.testing.assert_array_equal(levels[3], np.rint(255 * 0.7 * (ramp[0] / 255) ** (1 / 0.9)))
-    white = levels[:, 255]  # gamma leaves it as it is
+    white = levels[:, 255]  # gamma does not change white
     assert (np.diff(white)[::2] < -30).all()
     assert (np.diff(white)[1::2] == 0).all()
     assert (np.diff(levels[:, 128]) < 0).all()
@@ -172,10 +169,7 @@ def test_a_blackout_lasts_its_time_whatever_the_frame_rate(ms):
 
 
 def test_motion_blur_is_as_long_as_the_turn_while_the_shutter_is_open():
-    """The camera turns at 0.4 rad/s for 50 ms.
-
-    With a focal length of 400 pixels, the blur is 8 pixels long.
-    """
+    """At 0.4 rad/s for 50 ms and a focal length of 400 pixels, the blur is 8 pixels long."""
     point = np.zeros((160, 320), np.uint8)
     point[80, 160] = 255
     images = seen("motion:50", (point, point))
@@ -325,10 +319,7 @@ def test_stereo_gain_takes_stops_of_the_right_side_alone():
 
 @pytest.mark.parametrize(("law", "axis"), [("yaw", 1), ("pitch", 0)])
 def test_a_turned_camera_moves_the_image_by_arc_minutes(law, axis):
-    """With a focal length of 400 pixels, 30 arc minutes are 3.49 pixels.
-
-    The image moves to the left or downwards.
-    """
+    """With a focal length of 400 pixels, 30 arc minutes are 3.49 pixels."""
     image = np.zeros((160, 320), np.uint8)
     image[76:85, 156:165] = 255
     ours, theirs = seen(f"{law}:30", (image, image))

@@ -207,7 +207,7 @@ def test_command_line_end_to_end(kitti_tree, tmp_path):
                  "recording.rrd", "map.npz", "map.ply", "figures"):  # fmt: skip
         assert (folder / name).exists(), name
     assert len(read_kitti_poses(folder / "trajectory_kitti.txt")) == 28
-    # The command that the report prints gives the figure that it prints.
+    # The command in the report gives the ATE in the report.
     words = report["evo_command"].split()
     words[0] = str(Path(sys.executable).with_name(words[0]))
     printed = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
@@ -245,7 +245,7 @@ def test_run_without_pages_is_enough_for_a_report_later(kitti_tree, tmp_path):
 def test_interrupt_finishes_the_report_of_the_frames_done(kitti_tree, tmp_path, ended_by):
     root = tmp_path / "kitti"
     shutil.copytree(kitti_tree, root)
-    # The corridor there and back often enough to be still running when the signal comes.
+    # The corridor is repeated, so that the run has not ended when the signal arrives.
     folder = root / "sequences" / "00"
     order = [*range(28), *range(26, 0, -1)] * 12
     for side in ("image_0", "image_1"):
@@ -254,7 +254,8 @@ def test_interrupt_finishes_the_report_of_the_frames_done(kitti_tree, tmp_path, 
     (folder / "times.txt").write_text("".join(f"{0.1 * k:.6e}\n" for k in range(len(order))))
     shutil.rmtree(root / "poses")
     command = [sys.executable, "-m", "vslam", "run", "--data", str(root), "--no-record"]
-    environment = {**os.environ, "FORCE_COLOR": "1"}  # or no bar is drawn into a pipe
+    # Otherwise, no progress bar is written to a pipe.
+    environment = {**os.environ, "FORCE_COLOR": "1"}
     process = subprocess.Popen(
         command,
         cwd=tmp_path,
@@ -301,7 +302,7 @@ def test_full_disk_keeps_what_was_written(kitti_tree, tmp_path, monkeypatch, cap
     assert "No space left on device" in message
     assert "map.npz" in message
     latest = tmp_path / "runs" / "latest"
-    assert not (latest / "map.npz").exists()  # nor the half of it
+    assert not (latest / "map.npz").exists()  # not even a part of it
     assert len(read_kitti_poses(latest / "trajectory_kitti.txt")) == 5
     assert json.loads((latest / "report.json").read_text())["frames"] == 5
 

@@ -1,7 +1,4 @@
-"""Plug-ins: the package of docs/howto/plugins.md is installed and used.
-
-Broken packages are rejected.
-"""
+"""The package of docs/howto/plugins.md is installed and used. Broken packages are rejected."""
 
 from __future__ import annotations
 
@@ -191,7 +188,8 @@ def test_vslam_selects_frames_of_a_reader(installed, corridor, tmp_path: Path):
     assert second is None
     with pytest.raises(InputError, match=r"--calib: the reader frames .* leave the option out"):
         open_sequence("frames", data, calib=[Path("a.yaml")])
-    with pytest.raises(InputError, match=r"elsewhere\.npz: no such file"):  # its own words
+    # The plug-in's own message.
+    with pytest.raises(InputError, match=r"elsewhere\.npz: no such file"):
         open_sequence("frames", data, "elsewhere")
 
 

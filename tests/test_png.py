@@ -40,16 +40,16 @@ def header(image, depth=8, colour=0, interlaced=0):
 
 
 def filtered(image, filters):
-    """Filter the lines of an image and put the filter number before each line.
+    """Filter the lines of an image as in the PNG specification, section 9.
 
-    The code follows the PNG specification, section 9.
+    The number of the filter precedes each line.
     """
     padded = np.zeros((image.shape[0] + 1, image.shape[1] + 1), np.int64)
     padded[1:, 1:] = image
     a, b, c = padded[1:, :-1], padded[:-1, 1:], padded[:-1, :-1]
     p = a + b - c
     errors = np.stack([abs(p - a), abs(p - b), abs(p - c)])
-    paeth = np.choose(np.argmin(errors, axis=0), [a, b, c])  # of equal ones the first
+    paeth = np.choose(np.argmin(errors, axis=0), [a, b, c])  # the first one if several are equal
     predictions = np.stack([np.zeros_like(a), a, b, (a + b) // 2, paeth])
     lines = (image - predictions[filters, np.arange(len(image))]) % 256
     return np.column_stack([filters, lines]).astype(np.uint8).tobytes()
@@ -136,7 +136,6 @@ def test_damaged_image_data_is_not_taken_for_an_image():
 
 
 def test_no_mutation_is_accepted_with_other_pixels_than_opencvs():
-    """If vslam decodes a damaged file, OpenCV decodes it to the same pixels."""
     image = picture(24, 40)
     whole = png(image, zlib.compress(filtered(image, np.resize([4, 1, 2, 3], 24))), pieces=2)
     rng = np.random.default_rng(0)

@@ -63,7 +63,7 @@ def scene(seed: int, *, n: int = 100, outliers: float = 0.7, mono: bool = False)
 def test_ransac_finds_the_pose_among_seventy_percent_of_outliers(
     mono, median_m, worst_m, worst_degrees
 ):
-    # The best sample of three, not refined yet.
+    # The best sample of three points, before refinement.
     metres, degrees = [], []
     for seed in range(100):
         T, points, uvr, weight, wrong = scene(seed, mono=mono)

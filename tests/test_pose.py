@@ -18,10 +18,7 @@ KINDS = ["mono", "stereo", "mixed"]
 
 
 def observations(kind: str, n: int = 120, noise: float = 0.0, seed: int = 0):
-    """Make world points and what the camera at TRUTH sees of them.
-
-    Also return the inverse variances of the observations.
-    """
+    """Make world points, their observations at TRUTH, and the inverse variances of these."""
     rng = np.random.default_rng(seed)
     depth = rng.uniform(3, 40, n)
     pixels = rng.uniform([0, 0], [CAMERA.width, CAMERA.height], (n, 2))
@@ -114,14 +111,11 @@ def test_finds_gtsams_optimum_of_the_inliers(kind):
     assert np.count_nonzero(inlier) > 50
     expected = gtsam_pose(points[inlier], uvr[inlier], weight[inlier])
     assert pose_difference(T, expected) < 1e-6
-    assert pose_difference(T, TRUTH) > 1e-4  # noise: both are as far from the truth
+    assert pose_difference(T, TRUTH) > 1e-4  # because of the noise, both differ from the truth
 
 
 def test_octaves_weigh_the_observations():
-    """Half of the points are displaced by 1 px.
-
-    The pose follows the other half if its sigma is smaller.
-    """
+    """Half of the points are displaced by 1 px. The pose follows those with the smaller sigma."""
     points, uvr, _ = observations("stereo")
     uvr[::2, :2] += 1.0
     weight = np.ones(120)

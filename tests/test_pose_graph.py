@@ -77,7 +77,7 @@ def test_translation_error_spreads_evenly():
     missing = np.array([0.06, -0.024, 0.036])
     loop = inverse(T_wc[n - 1]) @ T_wc[0] @ translation(*missing)
     graph = chain_graph(T_wc, [(n - 1, 0)], [loop])
-    # Rotation is stiff: nothing of the error can hide in it.
+    # Rotation is fixed, so that it cannot absorb the error.
     graph = replace(graph, sigmas=np.tile([0.1, 1e-6], (n, 1)))
     T_cw = optimise(graph, CONFIG.model_copy(update={"robust_scale": 1e6}))
     moved = inverses(T_cw)[:, :3, 3] - T_wc[:, :3, 3]
@@ -148,10 +148,7 @@ def test_same_bytes_every_time():
 
 
 def make_map(views: list[range], T_cw: np.ndarray) -> Map:
-    """Make a map in which keyframe k observes the landmarks ``views[k]``.
-
-    Each keyframe is the parent of the next one.
-    """
+    """Make a chain of keyframes in which keyframe k observes the landmarks ``views[k]``."""
     map_ = Map(1.2 ** np.arange(8))
     n = max(view.stop for view in views)
     for k, view in enumerate(views):
@@ -181,7 +178,6 @@ def line_map(n: int = 8, shift: int = 60) -> Map:
 
 
 def named(graph: PoseGraph) -> dict[tuple[int, int], int]:
-    """Return the kind of each edge by the ids of its keyframes."""
     pairs = map(tuple, graph.keyframes[graph.edges].tolist())
     return dict(zip(pairs, graph.kind.tolist(), strict=True))
 
@@ -227,7 +223,7 @@ def test_culled_keyframes_are_left_out_and_their_loops_kept():
     graph = essential_graph(map_, [loop], CONFIG)
     assert graph.keyframes.tolist() == [0, 2, 3, 4, 5, 7]
     edges = named(graph)
-    assert edges[0, 5] == LOOP  # the parents of 1 and 6
+    assert edges[0, 5] == LOOP  # between the parents of 1 and 6
     assert edges[0, 2] == edges[5, 7] == TREE
     e = graph.kind.tolist().index(LOOP)
     np.testing.assert_allclose(
@@ -239,15 +235,13 @@ def test_culled_keyframes_are_left_out_and_their_loops_kept():
 
 
 def test_the_loop_edge_wins_over_the_edge_of_the_same_keyframes():
-    """A drifted covisibility edge between the same keyframes is replaced.
-
-    When the covisibility edge was kept instead, the ATE rose from 0.96 to 5.2 m (design.md, 13).
-    """
+    """When the drifted covisibility edge was kept instead, the ATE rose from 0.96 to 5.2 m."""
     map_ = line_map()
     T_covisible, T_tree = translation(0, 0, 1.5), translation(0, 0, 0.75)
     for loops in (
         [closed(2, 4, T_covisible), closed(5, 6, T_tree)],
-        [closed(4, 2, inverse(T_covisible)), closed(6, 5, inverse(T_tree))],  # named in reverse
+        # Keyframes in reverse order.
+        [closed(4, 2, inverse(T_covisible)), closed(6, 5, inverse(T_tree))],
         [closed(2, 4, np.eye(4)), closed(4, 2, inverse(T_covisible)), closed(5, 6, T_tree)],
     ):
         graph = essential_graph(map_, loops, CONFIG)
@@ -261,10 +255,7 @@ def test_the_loop_edge_wins_over_the_edge_of_the_same_keyframes():
 
 
 def test_a_drifted_covisibility_edge_would_hold_the_drift():
-    """This is why duplicate edges are removed.
-
-    The same loop is closed with and without the drifted edge.
-    """
+    """The same loop is closed with and without the drifted edge."""
     T_wc, loops, true = simulate(3)
     graph = chain_graph(T_wc, loops, true, reach=3)
     alone = check_pose_graph(graph, optimise(graph, CONFIG), CONFIG)
@@ -281,12 +272,12 @@ def test_a_drifted_covisibility_edge_would_hold_the_drift():
 
 
 def test_edges_that_fusing_would_add_are_not_in_the_graph_before_it():
-    """An edge between the two sides of the loop would contain the drift as if it were measured."""
+    """Such an edge across the loop would contain the drift as if it were measured."""
     map_ = line_map()
     loop = closed(7, 0, np.eye(4))
     before = named(essential_graph(map_, [loop], CONFIG))
     views = [range(60 * k, 60 * k + 240) for k in range(8)]
-    views[6] = views[0]  # fused: keyframe 6 observes what keyframe 0 does
+    views[6] = views[0]  # after fusion, keyframe 6 observes the landmarks of keyframe 0
     fused = make_map(views, map_.arrays.T_cw[:8])
     after = named(essential_graph(fused, [loop], CONFIG))
     assert (0, 6) in after
@@ -304,7 +295,7 @@ def test_edges_past_a_restart_are_weak():
     assert edges[3, 4] == WEAK
     assert list(edges.values()).count(WEAK) == 1
     assert not any(low < 4 <= high for low, high in edges if (low, high) != (3, 4))
-    # Its child takes its place when it is culled.
+    # If a keyframe is culled, its child replaces it.
     map_.cull_keyframe(4)
     graph = essential_graph(map_, [], CONFIG)
     edges = named(graph)
@@ -312,7 +303,7 @@ def test_edges_past_a_restart_are_weak():
     assert list(edges.values()).count(WEAK) == 1
     e = list(edges).index((3, 5))
     assert graph.sigmas[e].tolist() == [CONFIG.weak_translation, CONFIG.weak_rotation]
-    # Driven on, 2 m in the time between: half of it, and so many rad a second.
+    # The camera moved on by 2 m in the gap. The sigmas grow with this distance and with time.
     graph = essential_graph(map_, [], CONFIG, driven=True)
     assert named(graph)[3, 5] == GAP
     assert WEAK not in named(graph).values()
@@ -322,7 +313,7 @@ def test_edges_past_a_restart_are_weak():
         CONFIG.gap_rotation * max(elapsed, CONFIG.min_gap),
     ]
     assert graph.sigmas[e].tolist() == pytest.approx(expected)
-    # Not where nobody knew how fast it went.
+    # There is no such edge if the speed was unknown.
     map_.keyframes.restart[4] = UNPREDICTED
     graph = essential_graph(map_, [], CONFIG, driven=True)
     assert named(graph)[3, 5] == WEAK
@@ -353,7 +344,6 @@ SIDES = (70.0, 40.0)
 
 
 def route(n: int, step: float = 1.2) -> np.ndarray:
-    """Return ``(n, 4, 4)`` T_wc of several laps around a rectangle of 220 m."""
     long, short = SIDES
     along = np.arange(n) * step % (2 * (long + short))
     corners = np.array([0.0, long, long + short, 2 * long + short])
@@ -446,7 +436,7 @@ def test_a_wrong_loop_among_true_ones_is_recognised_and_ignored(metres):
 
 def test_a_random_place_is_refused_though_nothing_else_speaks_against_it():
     for seed in range(6):
-        T_wc, _, _ = simulate(seed, n=170)  # not yet round the block
+        T_wc, _, _ = simulate(seed, n=170)  # less than one lap
         rng = np.random.default_rng(seed)
         query, match = 160, int(rng.integers(20, 80))
         T = se3_exp(rng.normal(size=6) * np.repeat([0.5, 0.05], 3))
@@ -464,10 +454,7 @@ def test_a_loop_off_by_ten_metres_after_two_hundred_is_refused():
 
 @pytest.mark.parametrize(("metres", "yaw"), [(5.0, 0.3), (60.0, 1.6), (200.0, 3.0)])
 def test_a_part_that_began_anew_is_joined_from_wherever_it_was(metres, yaw):
-    """A loop across a weak edge moves the part after the restart as a whole.
-
-    It does not deform this part.
-    """
+    """A loop across a weak edge moves the part after the restart without deforming it."""
     T_wc, loops, measured = simulate(1, n=260, drift=0.5)
     jump = T_wc[119] @ turn(yaw) @ translation(0.6 * metres, 0, 0.8 * metres) @ inverse(T_wc[119])
     lost = T_wc.copy()

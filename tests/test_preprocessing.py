@@ -24,10 +24,7 @@ def walls(direction: np.ndarray, height: np.ndarray) -> np.ndarray:
 
 
 def flat_image(heading: float) -> torch.Tensor:
-    """Return the image of a pinhole camera that looks at the walls.
-
-    The camera has turned by ``heading`` radians.
-    """
+    """Return the image of a pinhole camera that has turned by ``heading`` radians."""
     y, x = (((np.arange(n) + 0.5) / n * 2 - 1) for n in SIZE)
     direction = np.arctan(x * math.tan(math.radians(HALF_ANGLE)))
     image = walls(direction + heading, y[:, None] * np.cos(direction))
@@ -43,7 +40,7 @@ def test_unrolled_images_show_the_cylinder_whatever_the_heading(heading, middle)
     beyond = np.abs(middle * y[:, None] / np.cos(direction)) > 1 + 1 / SIZE[0]
     expected = walls(direction + heading, middle * np.repeat(y[:, None], SIZE[1], 1))
     within = np.abs(middle * y[:, None] / np.cos(direction)) < 1 - 1 / SIZE[0]
-    # The outermost pixels are half black.
+    # The outermost pixels are partly black.
     assert np.abs(seen - expected)[within].max() < 0.01
     assert np.all(seen[beyond] == 0)
     assert np.all(seen > 0) == (middle < 0.9)

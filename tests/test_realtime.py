@@ -46,7 +46,7 @@ def test_no_frame_comes_before_its_time_and_the_last_one_always_comes(threads):
             index = round((played.timestamp - 100.0) / 0.02)
             assert played.prepared[0] == played.timestamp
             assert played.prepared[1] >= played.arrived >= begin + 0.02 * index
-    assert [played.timestamp for played in seen] == times.tolist()  # dropped ones too
+    assert [played.timestamp for played in seen] == times.tolist()  # including dropped frames
     assert seen[0].prepared is not None
     assert seen[-1].prepared is not None
 
@@ -115,7 +115,7 @@ def test_an_error_of_the_camera_comes_after_its_frames():
 
 
 def test_a_live_camera_sets_the_pace_and_dropped_frames_are_let_go():
-    """The time stamps of a live camera do not matter.
+    """The timestamps of a live camera do not matter.
 
     Only frames that wait or are being processed are kept in memory.
     """
@@ -140,10 +140,7 @@ def test_a_live_camera_sets_the_pace_and_dropped_frames_are_let_go():
 
 
 def test_frames_that_were_dropped_are_not_lost(corridor, check_map):
-    """Four of seven frames are dropped.
-
-    Tracking continues, and the poses of the dropped frames lie on the path.
-    """
+    """Four of seven frames are dropped. Their poses lie on the path."""
     slam = Slam(corridor.camera, Config(orb=OrbConfig(n_features=800)), "none", threads=1)
     states = []
     for k in range(len(corridor.left)):
@@ -171,10 +168,7 @@ def test_one_camera_in_real_time(kitti_tree, threads):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
-    """The unreadable image belongs to the last frame, which is never dropped.
-
-    The run still ends normally.
-    """
+    """It belongs to the last frame, which is never dropped. The run still ends normally."""
     root = tmp_path / "kitti"
     shutil.copytree(kitti_tree, root)
     image = root / "sequences" / "00" / "image_0" / "000005.png"

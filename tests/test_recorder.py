@@ -102,7 +102,7 @@ def record(recorder: Recorder, frames: int = FRAMES, camera: Camera = CAMERA) ->
         recorder.frame(result)
         if result.is_keyframe:
             features = _features(rng)
-            # Equal images would be compressed away.
+            # Equal images would be compressed too well.
             image = np.roll(image, rng.integers(1, 100), axis=1)
             recorder.keyframe(result, image, features.xy, rng.random(2000) < 0.25)
             new = rng.normal(0.0, 20.0, (LANDMARKS_PER_KEYFRAME, 3)) + result.T_wc[:3, 3]
@@ -113,7 +113,7 @@ def record(recorder: Recorder, frames: int = FRAMES, camera: Camera = CAMERA) ->
         recorder.map(map_)
         if frame in LOOPS:
             recorder.loops(LOOPS[frame], map_)
-        if frame == SHIFTED_AT:  # as by a correction
+        if frame == SHIFTED_AT:  # like a loop correction
             map_.arrays.T_cw[: map_.n_keyframes, 1, 3] -= 5.0
     recorder.finish(Trajectory(0.1 * np.arange(frames), poses), map_)
 
@@ -145,12 +145,12 @@ def test_entities_and_their_frames(recording: Path) -> None:
         "world/camera/image": 1 + keyframes,
         "world/camera/image/tracked": 1 + keyframes,
         "world/camera/image/untracked": 1 + keyframes,
-        "world/landmarks": 1 + 2 + 1,  # the first keyframe, a loop (25 more to go), the end
+        "world/landmarks": 1 + 2 + 1,  # the first keyframe, a loop, the end
         "world/keyframes": 2 + 1,
-        "world/loops/accepted": 2 + 1,  # decided twice, at the end
+        "world/loops/accepted": 2 + 1,  # two decisions, and the end
         "world/loops/rejected": 6,  # shown and hidden
         "state/loops": 6,
-        "loops/images": 2,  # of those accepted
+        "loops/images": 2,  # of accepted loops
         "world/ground_truth": 1,
         "world/trajectory": 1 + FRAMES,
         "points/inliers": 1 + FRAMES,
@@ -168,7 +168,7 @@ def test_a_monocular_recording_counts_features_in_place_of_stereo_matches(tmp_pa
 
 
 def test_size_budget(recording: Path) -> None:
-    # The map grows with the run, but at 30,000 points for one in 75 frames it adds 5 MB at most.
+    # The map grows with the run, but adds at most 5 MB (30,000 points in one of 75 frames).
     assert 1000 / FRAMES * recording.stat().st_size + 5e6 < 50e6
 
 
@@ -222,7 +222,7 @@ def _strips(row: dict[str, Any]) -> NDArray[np.float32]:
 def test_rejected_loops_are_shown_for_a_while(recording: Path) -> None:
     shown = rows(recording, "world/loops/rejected")
     assert [row["frame"] for row in shown] == [12, 32, 42, 62, 70, 90]
-    # The frame that is not in the map has no place: one line of two candidates.
+    # A frame that is not in the map has no position, so that there is only one line.
     assert [len(_strips(row)) for row in shown] == [1, 0, 1, 0, 0, 0]
     ends = [_pose(0)[:3, 3], _pose(3 * FRAMES_PER_KEYFRAME)[:3, 3]]
     np.testing.assert_allclose(_strips(shown[0])[0], ends, atol=1e-5)
@@ -234,7 +234,7 @@ def test_accepted_loops_stay_and_move_with_the_map(recording: Path) -> None:
     assert [len(_strips(row)) for row in shown] == [1, 2, 2]
     before, after = _strips(shown[1]), _strips(shown[2])
     np.testing.assert_allclose(after - before, np.full((2, 2, 3), [0, 5, 0]), atol=1e-5)
-    # A loop closed shows the map corrected, unless one was shown just before.
+    # After a loop closure, the corrected map is shown, unless the map was shown just before.
     assert [row["frame"] for row in rows(recording, "world/keyframes")] == [0, 42, 99]
 
 
@@ -306,7 +306,7 @@ def test_almost_full_disk_ends_the_recording_cleanly(
 
 @pytest.mark.slow
 def test_failing_disk_neither_ends_nor_hangs_the_run(tmp_path: Path) -> None:
-    # Rerun's writer thread dies at the limit; in a process of its own, for it must end, too.
+    # Rerun's writer thread dies at the limit. A separate process shows that the program ends.
     script = """
         import resource, sys
         from pathlib import Path
@@ -341,10 +341,7 @@ time.sleep(60)
 
 @pytest.fixture
 def window(monkeypatch):
-    """A process in place of the viewer's window.
-
-    It receives the data that are sent to the window.
-    """
+    """A process in place of the viewer's window, which receives the data that are sent to it."""
     started = []
 
     def start(port, words):
@@ -392,7 +389,7 @@ def test_a_page_shows_the_run(tmp_path, monkeypatch, caplog):
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     viewer = open_viewer("web")
     assert b"<html" in urlopen(viewer.address).read().lower()
-    # Who listens on all interfaces listens on every address of this machine.
+    # A server on all interfaces listens on every address of this machine.
     for port in map(int, re.findall(r"(?:localhost|127\.0\.0\.1):(\d+)", viewer.address)):
         with socket.socket() as elsewhere:
             assert elsewhere.connect_ex(("127.0.0.2", port)) == errno.ECONNREFUSED

@@ -77,14 +77,10 @@ class Place:
         )
 
     def find(self) -> Found:
-        """Return where a lost frame is found."""
         return self.check(LOST)
 
     def find_better(self, n_inliers: int) -> Found:
-        """Return where a doubtful frame is found.
-
-        The frame was tracked with the given number of inliers.
-        """
+        """Return where a doubtful frame is found that was tracked with this number of inliers."""
         return self.check(doubtful(n_inliers))
 
 
@@ -108,7 +104,6 @@ def doubtful(n_inliers: int) -> Found:
 
 
 def track_elsewhere(frame: Frame) -> None:
-    """Let a frame track some landmarks at a wrong pose."""
     frame.T_cw = se3_exp(np.full(6, 0.1))
     frame.landmark[:40] = np.arange(100, 140)
     frame.xyz[:40] = 7.0
@@ -118,7 +113,6 @@ def track_elsewhere(frame: Frame) -> None:
 
 
 def everything(frame: Frame) -> list[bytes]:
-    """Return everything that a frame holds."""
     return [
         value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
         for value in (getattr(frame, field.name) for field in fields(frame))
@@ -158,7 +152,8 @@ def test_where_orb_finds_nothing_the_frame_may_be_recognised_in_another_way(matc
     place = Place.create(matches, recognise)
     before = map_bytes(place.world)
     frame, localised = place.frame, recognise.localised
-    frame.shift = np.zeros((len(frame.features), 2), np.float32)  # of matches that are no more
+    # Shifts of matches that are removed.
+    frame.shift = np.zeros((len(frame.features), 2), np.float32)
     found = place.find()
     assert (found.state, found.n_inliers, found.keyframe) == (TrackingState.OK, 30, 2)
     assert len(recognise.asked) == 1
@@ -187,13 +182,13 @@ def test_a_frame_that_nothing_recognises_is_found_nowhere():
 
 
 def by_orb(**thresholds: float) -> tuple[Place, int]:
-    """Make a place where ORB descriptors find the frame. Also return the number of inliers."""
+    """Make a place where ORB descriptors find the frame, and return the number of inliers."""
     n = Place.create([HERE], Recognise()).find().n_inliers
     return Place.create([HERE], Recognise(), **thresholds), n
 
 
 def by_others(**thresholds: float) -> tuple[Place, int]:
-    """Make a place where other descriptors find the frame. Also return the number of inliers."""
+    """Make a place where other descriptors find the frame, and return the number of inliers."""
     return Place.create([NOT_HERE], Recognise(30), **thresholds), 30
 
 

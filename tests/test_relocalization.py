@@ -28,10 +28,7 @@ def mapped_street() -> World:
 
 
 def lost_frame(world: World, T_cw: np.ndarray, *, mono: bool = False, among=None) -> Frame:
-    """Return what a camera sees of the street.
-
-    All points except those in ``among`` look different now.
-    """
+    """Return what a camera sees of the street, where only the points in ``among`` look the same."""
     if among is not None:
         changed = ~np.isin(np.arange(len(world.points)), among)
         world.descriptors[changed] = world.rng.integers(

@@ -177,7 +177,8 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
         living = np.setdiff1d(np.arange(loop.query + 1), [50])
         T_wc = truth[keyframe_frames[living]].copy()
         T_cw_after = np.linalg.inv(T_wc)
-        T_wc[:, 0, 3] += 8.0 * living / len(keyframe_frames)  # drift before, none after
+        # Drift before the correction, and none after it.
+        T_wc[:, 0, 3] += 8.0 * living / len(keyframe_frames)
         corrections.append(LoopCorrection(loop, living, np.linalg.inv(T_wc), T_cw_after, 0.12))
     timestamps = np.arange(frames) * 0.1
     return replace(
@@ -196,10 +197,7 @@ def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
 
 
 def report_of(outcome: RunOutcome, folder: Path) -> ReportJson:
-    """Write the report as the command line does.
-
-    Check that the file on the disk equals the result.
-    """
+    """Write the report as the command line does, and check that the file equals the result."""
     report = write_results(folder, outcome)
     assert ReportJson.model_validate_json((folder / "report.json").read_bytes()) == report
     return report
@@ -416,7 +414,7 @@ def test_comparison_is_in_every_text(looped: tuple[RunOutcome, Path]) -> None:
         assert getattr(own, name) == getattr(report, name), name
     for name in ("ate_rmse_m", "rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m"):
         assert getattr(compared, name) == getattr(expected, name), name
-    assert compared.causal_ate_rmse_m == expected.ate_rmse_m  # the stub has no other poses
+    assert compared.causal_ate_rmse_m == expected.ate_rmse_m  # the stub has only these poses
     counts = ("loops_closed", "loops_found", "loops_missed", "loops_wrong")
     assert [getattr(own, name) for name in counts] == [4, 1, 0, 1]
     assert [getattr(compared, name) for name in counts] == [0, 0, 1, 0]
@@ -466,7 +464,7 @@ def test_rejected_loops_do_not_drown_the_table(looped: tuple[RunOutcome, Path]) 
         "264",
         "320",
         "400",
-    ]  # wrong first
+    ]  # wrong loops come first
     assert "wrong" in rows[0]
     reasons = [line for line in blocks["Loops rejected"].splitlines() if line.startswith("|")][2:]
     assert len(reasons) == 2
@@ -493,7 +491,7 @@ def test_closed_loops_are_shown_in_pictures(tmp_path: Path) -> None:
         for query, match in ((264, 12), (320, 68), (360, 200), rejected)
     ]
     write_results(tmp_path, outcome, pictures=pictures)
-    # The wrong one first, then the one by learned descriptors; that of frame 400 has no picture.
+    # The wrong loop comes first, then the one by learned descriptors. Frame 400 has no picture.
     names = ["loop-360-200.jpg", "loop-320-68.jpg", "loop-264-12.jpg"]
     captions = [
         "Frame 360 (right) was wrongly matched to the place of frame 200 (left): 84 matches agree; "
@@ -570,7 +568,8 @@ def test_loops_without_ground_truth() -> None:
     labels = top_view(outcome, None, None).axes[0].get_legend_handles_labels()[1]
     assert labels == ["estimate", "start", "weak (4)", "loop (4)"]
     labels = loop_closing(outcome, None).axes[0].get_legend_handles_labels()[1]
-    assert labels == ["before", "after", "loop, before (3)"]  # the match of one was culled
+    # In one loop, the matched keyframe was culled.
+    assert labels == ["before", "after", "loop, before (3)"]
 
 
 def test_interrupted_run_is_not_blamed_for_revisits_to_come() -> None:
@@ -599,10 +598,7 @@ def test_a_right_loop_on_a_revisit_too_short_to_count_is_explained() -> None:
 
 
 def test_before_is_drawn_in_the_frame_of_the_ground_truth() -> None:
-    """The estimate has its own world frame and is aligned.
-
-    The keyframes before the correction are aligned in the same way.
-    """
+    """The keyframes before the correction are aligned in the same way as the estimate."""
     outcome = two_laps()
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
@@ -635,7 +631,7 @@ def test_a_monocular_report_speaks_of_no_stereo_and_no_metres(make, tmp_path: Pa
     without_truth = replace(outcome.sequence, ground_truth=None)
     report_of(replace(outcome, sequence=without_truth, compared=()), tmp_path)
     text = (tmp_path / "report.md").read_text()
-    assert "stereo" not in text.lower().replace("| stereo ", "")  # a stage of the made-up run
+    assert "stereo" not in text.lower().replace("| stereo ", "")  # the name of a stage
     assert "in units of the map" in text or "Moved" not in text
     assert not re.search(r"\d\.\d\d m\b", text)
     assert top_view(outcome, None, None).axes[0].get_xlabel() == "x (map units)"

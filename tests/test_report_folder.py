@@ -135,10 +135,7 @@ ALL = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PARTS)
 def test_a_result_that_fails_costs_itself_alone(tmp_path, monkeypatch, name):
-    """This holds for any exception.
-
-    An error in the figures once prevented that the map was saved.
-    """
+    """An error in the figures once prevented the map from being saved."""
 
     def fails(*args):
         raise KeyError("a fault\nof vslam")

@@ -23,10 +23,7 @@ CAMERA = Camera(700.0, 710.0, 320.0, 120.0, 0.5, 640, 240)
 
 @kernel
 def errors_of(points, uvr, inverse_sigma2, intrinsics):
-    """Compute the errors of N observations.
-
-    For each observation, return the ratio of the test, the residual, its chi-square and the limit.
-    """
+    """Return the ratio, the residual, its chi-square and the limit for each observation."""
     n = len(points)
     ratio, r, chi2, limit = np.empty(n), np.empty((n, 3)), np.empty(n), np.empty(n)
     pinhole = unpacked(intrinsics)

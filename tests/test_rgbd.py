@@ -129,15 +129,15 @@ def test_features_without_depth_are_monocular(corridor):
     assert 100 < np.count_nonzero(known) < len(known) - 100
     found = camera.bf / (features.xy[known, 0] - features.u_right[known])
     np.testing.assert_allclose(found, depth[rows, columns][known], rtol=1e-3)
-    assert extracted.pyramid is None  # matches are not aligned
+    assert extracted.pyramid is None  # no pyramid, because matches are not aligned
 
 
 def test_a_corner_at_an_edge_of_depth_has_none():
     camera = Camera(100.0, 100.0, 20.0, 20.0, 0.5, 40, 40, depth=True)
     depth = np.full((40, 40), 2.0, np.float32)
     depth[:, 20:] = 2.3  # farther by 15 %
-    depth[30:] = 2.1  # by 5 %: no edge
-    depth[0:4, 0:4] = 0.0  # unknown depth tells nothing
+    depth[30:] = 2.1  # 5 % is no edge
+    depth[0:4, 0:4] = 0.0  # unknown depth is no edge
     xy = np.array([[14, 9], [15, 9], [16, 9], [23, 9], [24, 9], [8, 33], [5, 5], [19, 9]])
     around = {radius: columns_of_depth(
         xy.astype(np.float32), np.ones(len(xy)), depth, camera, DepthConfig(edge_radius=radius)
@@ -195,8 +195,8 @@ def test_light_does_not_change_depth():
 def test_association_takes_the_nearest_first_and_each_once():
     first = np.array([0.000, 0.010, 0.100, 0.200])
     second = np.array([0.008, 0.085, 0.110, 0.221])
-    # 0.010 takes 0.008, so that 0.000 is left alone; 0.110 is nearer to 0.100 than 0.085 is;
-    # 0.221 is farther than 20 ms from 0.200.
+    # 0.010 is paired with 0.008, so that 0.000 has no pair. 0.110 is nearer to 0.100 than 0.085.
+    # 0.221 differs from 0.200 by more than 20 ms.
     a, b = associate(first, second, 0.02)
     assert (a.tolist(), b.tolist()) == ([1, 2], [0, 2])
 

@@ -105,4 +105,4 @@ def test_the_state_comes_back_equal_and_continues_alike():
             each.observe(prepared(extracted, each, twist), twist)
     assert other.state() == one.state()
     assert (other.delay.seconds, other.delay.sigma) == (one.delay.seconds, one.delay.sigma)
-    assert state.delay == kept  # what was given away does not change any more
+    assert state.delay == kept  # a returned state does not change any more

@@ -37,7 +37,7 @@ from vslam.report.folder import write_results
 from vslam.trajectory import read_trajectory
 
 ROOT = Path(__file__).parents[1]
-TRANSIENT_LOCAL = 1  # of rmw's enum rmw_qos_durability_policy_t
+TRANSIENT_LOCAL = 1  # value in rmw's enum rmw_qos_durability_policy_t
 AHEAD = se3_exp(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
 RIGHT_TURN = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.0]))
 
@@ -114,7 +114,7 @@ def test_a_bag_says_what_the_files_of_the_run_say(folder, tmp_path, online):
     ((_, static),) = bag["/tf_static"]
     (fixed,) = static.transforms
     assert (fixed.header.frame_id, fixed.child_frame_id) == ("base_link", "camera_optical")
-    # From the camera along the tree of frames: its pose in the map, with the axes of ROS.
+    # The pose of the camera in the map, computed along the tree of frames.
     for k, (time, tf) in enumerate(bag["/tf"]):
         names = [(one.header.frame_id, one.child_frame_id) for one in tf.transforms]
         assert names == [("map", "odom"), ("odom", "base_link")]
@@ -176,10 +176,7 @@ def track(T: np.ndarray, local: np.ndarray | None) -> TrackResult:
 
 
 def test_the_axes_are_those_of_rep_103():
-    """The camera drives ahead, turns right and drives ahead again.
-
-    First x increases, then y decreases.
-    """
+    """The camera moves ahead, turns right and moves ahead. First x increases, then y decreases."""
     types = types_of_ros()
     before, now = AHEAD, AHEAD @ RIGHT_TURN @ AHEAD
     poses = [FramePose.of(track(T, None), t) for T, t in ((before, 10**9), (now, 3 * 10**9))]
@@ -289,10 +286,7 @@ def test_files_of_a_run_that_were_lost_or_changed(folder, tmp_path, name, text, 
 
 
 def infos(baseline: float = 0.5, **changed: object) -> list[SimpleNamespace]:
-    """Return the ``camera_info`` of a rectified pair.
-
-    ``changed`` are fields of the right camera.
-    """
+    """Return the ``camera_info`` of a rectified pair, with ``changed`` fields on the right."""
     pair = []
     for side in (0, 1):
         P = [700.0, 0, 310, -side * 700 * baseline, 0, 710, 120, 0, 0, 0, 1, 0]

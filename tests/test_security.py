@@ -147,7 +147,8 @@ def test_images_of_absurd_size_are_refused_by_their_header(tmp_path: Path, width
         "from vslam.errors import UnreadableImageError\n"
         "try: read_grey(Path(sys.argv[1]))\n"
         "except UnreadableImageError as error: print(error)\n"
-        "status = Path('/proc/self/status').read_text()\n"  # getrusage begins with the parent's
+        # getrusage starts at the peak of the parent.
+        "status = Path('/proc/self/status').read_text()\n"
         "print(int(re.search(r'VmHWM:\\s+(\\d+)', status)[1]) // 1024)\n"
     )
     done = subprocess.run(
@@ -214,7 +215,7 @@ def test_what_people_write_is_escaped_in_pages(tmp_path: Path):
     assert "<script>alert" not in page
 
 
-# Calls that execute what they read, or lead out of a folder, by the last part of their name.
+# The last parts of the names of calls that execute what they read, or write outside a folder.
 FORBIDDEN = {"eval", "exec", "system", "popen", "extractall", "extract", "unpack_archive"}
 FORBIDDEN_MODULES = {"pickle", "dill", "shelve", "marshal", "tarfile", "joblib"}
 

@@ -57,7 +57,7 @@ def features(n: int) -> Features:
 
 
 def a_map(keyframes: int, covisible: tuple[tuple[int, int], ...] = ()) -> Map:
-    """Make a map of keyframes with 20 features each. The keyframes of a pair share 16 landmarks."""
+    """Make a map of keyframes with 20 features. The keyframes of a pair share 16 landmarks."""
     map_ = Map(np.ones(8))
     for k in range(keyframes):
         map_.add_keyframe(features(100), np.eye(4), float(k), k)
@@ -72,7 +72,7 @@ def a_map(keyframes: int, covisible: tuple[tuple[int, int], ...] = ()) -> Map:
 
 
 SCENES = views(100).images[::2]
-# Textures, nothing like the training data.
+# Textures, which are unlike the training data.
 WALLS = [
     cv2.resize(np.random.default_rng(k).integers(0, 256, (9, 13), np.uint8), (620, 188))
     for k in range(14)
@@ -89,7 +89,7 @@ def exported() -> OnnxNetwork:
 
 
 def detector(config: SiameseConfig | None = None, places: list[int] | None = None):
-    """Make a detector that was given one image for each keyframe, by the number of the scene."""
+    """Make a detector with one image for each keyframe, from the scenes in ``places``."""
     config = config or SiameseConfig(recent_keyframes=3, threshold=0.0)
     found = SiameseDetector(exported(), config)
     for keyframe, place in enumerate(places or []):
@@ -240,7 +240,7 @@ def test_reach_grows_with_the_way_and_knows_nothing_of_lost_cameras_and_units():
     np.testing.assert_allclose(
         beyond, [30 - 20 - 37, 70 - 20 - 27, 170 - 20 - 17, 70 - 20 - 7, -20]
     )
-    np.testing.assert_allclose(  # in the unit of the map, whatever that is
+    np.testing.assert_allclose(  # in the arbitrary unit of the map
         beyond_reach(driven(x, stereo=False), 4, config),
         [30 - 185, 70 - 135, 170 - 85, 70 - 35, 0],
     )
@@ -279,12 +279,12 @@ def test_the_network_sees_nothing_until_the_camera_may_be_back():
         images.add(keyframe, image)
     assert one.query(9, map_) == []
     assert network.seen == 0
-    # Back at the start, where 20 m and a tenth of 900 m may hide it: the two nearest are seen.
+    # At the start again, the limit is 20 m and a tenth of 900 m. The two nearest are compared.
     assert {found.match for found in one.query(10, map_)} == {0, 1}
     assert network.seen == 3
     assert {found.match for found in one.query(10, map_)} <= {0, 1, 2}
     assert network.seen == 4
-    # A lost frame may be anywhere: all are seen, once.
+    # A lost frame may be anywhere, so that each keyframe is compared once.
     assert one.locate(SCENES[5], Features.none(), map_)[0].match == 5
     assert network.seen == 4 + 7 + 1
     one.locate(SCENES[6], Features.none(), map_)
@@ -296,10 +296,7 @@ def test_the_network_sees_nothing_until_the_camera_may_be_back():
 
 @pytest.mark.slow
 def test_a_run_takes_the_weights_of_a_file(kitti_tree, tmp_path):
-    """With random weights, many wrong places are similar.
-
-    Geometric verification must reject them.
-    """
+    """With random weights, many wrong places are similar. Geometric verification rejects them."""
     path = tmp_path / "capsule.onnx"
     export_onnx(small_network(), path)
     settings = tmp_path / "config.json"
@@ -324,7 +321,7 @@ def test_onnx_says_what_torch_says(name):
     images[2] = 0
     descriptors = np.stack([network.embed(image) for image in images])
     expected = torch_network.embed(to_tensor(images))
-    # The blurred image has little contrast: stretching it to deviation 1 magnifies rounding.
+    # The blurred image has little contrast. Normalisation to a deviation of 1 magnifies rounding.
     assert np.abs(descriptors - expected.numpy()).max() < 2 * TOLERANCE
     alike = torch_network.compare(expected[0], expected).numpy()
     alike_here = network.compare(descriptors[0], descriptors)
@@ -354,9 +351,9 @@ def test_train_writes_weights_and_card(tmp_path):
     files = {path.name for path in out.iterdir()}
     assert files >= {"capsule.safetensors", "capsule.onnx", "capsule.json", "capsule.md",
                      "log.csv", "checkpoint.pt", "settings.json", "pairs"}  # fmt: skip
-    assert json.loads((out / "capsule.json").read_text())["seed"] == 3  # that of the settings
+    assert json.loads((out / "capsule.json").read_text())["seed"] == 3  # the seed of the settings
     full, shipped = out / "capsule.safetensors", tmp_path / "ship" / "capsule.safetensors"
-    # Without settings of its own a training takes images of the size that its weights take.
+    # Without settings, training uses the image size of the weights.
     command = ["train", "capsule-pruned", "--data", f"pairs:{data}", "--weights", str(full)]
     command += ["--pairs", "16", "--epochs", "1", "--out", str(tmp_path / "p"), "--threads", "1"]
     done = CliRunner().invoke(app, command)
@@ -407,11 +404,11 @@ def test_no_run_loads_torch():
 def test_the_paper_s_detector_compares_with_all_keyframes_and_verifies_by_orb():
     config = Config()
     detector, images = detector_with_images("capsule-paper", config)
-    assert images is None  # so that no local descriptors rerank or verify
+    assert images is None  # local descriptors neither rerank nor verify
     camera = Camera(400.0, 400.0, 310.0, 94.0, 0.5, 620, 188)
     verifier = verifier_for(config, camera, images)
     closing = LoopClosing(detector, verifier, camera, config, threads=1)
-    # Odometry puts the last keyframe 700 m from the first one, whose place it shows, darker.
+    # According to odometry, the last keyframe is 700 m from the first one, but shows its place.
     map_ = driven([50.0 * k for k in range(15)])
     for keyframe, place in enumerate([*range(14), 0]):
         image = WALLS[place] if keyframe < 14 else np.uint8(np.roll(WALLS[place], 12, 1) * 0.7)

@@ -1,7 +1,4 @@
-"""The delay of the right image is measured from the rows of stereo matches.
-
-A drive with a delay that the calibration states is nearly as accurate as one without a delay.
-"""
+"""The delay of the right image is measured from the rows of stereo matches, and corrected."""
 
 from __future__ import annotations
 
@@ -32,10 +29,9 @@ SCALES = 1.2 ** np.arange(8)
 def seen(
     twist: np.ndarray, delay: float, n: int = 200, seed: int = 0, noise: float = 0.1
 ) -> tuple[Extracted, np.ndarray]:
-    """Return the exact projections of points into both images.
+    """Return the exact projections of points into both images, of which the right one is late.
 
-    The right image is late by the given delay. Also return the columns in the right image without
-    delay.
+    Also return the columns in the right image without delay.
     """
     rng = np.random.default_rng(seed)
     z = rng.uniform(4.0, 40.0, n)
@@ -64,7 +60,7 @@ def add(found: SideDelay, extracted: Extracted, twist: np.ndarray | None) -> Non
 
 
 def drive(frames: int) -> list[np.ndarray]:
-    """Return the poses of a car that drives ahead with varying speed, nods and turns."""
+    """Return the poses of a car that moves ahead with varying speed, nods and turns."""
     t = 0.1 * np.arange(frames)
     zero = np.zeros(frames)
     return list(
@@ -94,7 +90,7 @@ def test_speeds_are_the_derivatives_of_projections():
         assert late.row_offset is not None
         moved = (late.row_offset - still.row_offset) / 1e-5
         expected = CAMERA.fy * row_speeds(x, y, inverse_depth)[:, k]
-        assert moved == pytest.approx(expected, abs=2.0)  # pixels a second, of up to 400
+        assert moved == pytest.approx(expected, abs=2.0)  # pixels per second; up to 400 occur
 
 
 @pytest.mark.parametrize("delay", [-8e-3, 3e-3, 12e-3])
@@ -108,10 +104,9 @@ def test_a_delay_is_measured_and_reported_unless_the_calibration_gives_it(delay)
 
 @pytest.mark.slow
 def test_a_known_delay_costs_a_drive_little():
-    """The car drives a quarter of a ring road at 15 m/s.
+    """The car passes a quarter of a ring road at 15 m/s. The right image is 5 ms late.
 
-    The right image is 5 ms late. The remaining error comes from the first frame, whose motion is
-    not known.
+    The remaining error comes from the first frame, whose motion is not known.
     """
     frames = [float(k) for k in range(LAP // 4)]
     T_start = inverse(Ring.create().pose(0))

@@ -86,7 +86,7 @@ def test_a_bright_strip_that_one_side_sees_is_no_gain(side):
     pair = [left.copy(), right.copy()]
     for image in pair:
         image[:50] = 255  # the sky
-    pair[side][50:66] = 150  # beyond the edge of the other image
+    pair[side][50:66] = 150  # outside the view of the other image
     assert compare_sides(*pair, CONFIG) == Sides()
     assert balance(*pair)[side] is pair[side]
 
@@ -203,10 +203,7 @@ TWIST = np.array([0.3, 0.0, -8.0, 0.0, -0.3, 0.0])  # per second: ahead and to t
 
 
 def driven(delay_s: float = 0.0, turned_px: float = 0.0, n: int = 5000) -> SimpleNamespace:
-    """Make a map of 10 keyframes with exact observations.
-
-    Only those of the right image have errors.
-    """
+    """Make a map of 10 keyframes with exact left observations and wrong right observations."""
     rng = np.random.default_rng(1)
     times = 0.1 * np.arange(10)
     T_cw = np.array([se3_exp(TWIST * t) for t in times])
@@ -245,7 +242,7 @@ def test_a_map_that_cannot_tell_says_nothing():
     assert measure_rig(driven(), CAMERA.left_camera()) is None
     still = driven()
     still.timestamps = 100.0 * np.arange(10)
-    assert measure_rig(still, CAMERA) is None  # gaps: nobody knows how it moved
+    assert measure_rig(still, CAMERA) is None  # in gaps, the motion is unknown
     assert residual_warnings(None, CAMERA) == []
 
 

@@ -41,7 +41,6 @@ def scene(seed: int, n: int, outliers: float, scale: float = 1.0, noise: float =
 
 
 def errors(T: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Return the differences in metres and in degrees."""
     twist = se3_log(T @ inverse(truth))
     return float(np.linalg.norm(twist[:3])), float(np.degrees(np.linalg.norm(twist[3:])))
 
@@ -91,8 +90,8 @@ def test_points_of_weight_zero_do_not_count():
 
 
 def test_seventy_percent_of_outliers():
-    # Of 100 matches 30 are right, and 0.7 px of noise in each camera takes 1 in 10 of them in each
-    # camera: some 25 are left for RANSAC to find.
+    # Of 100 matches, 30 are right. Noise of 0.7 px makes one in ten of them an outlier in each
+    # camera, so that about 25 are left.
     metres, degrees = [], []
     for seed in range(100):
         T, a, b, wrong = scene(seed, 100, 0.7)

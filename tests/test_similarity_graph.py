@@ -96,7 +96,7 @@ def test_a_lap_whose_scale_drifted_closes():
     truth, estimate = drifted_lap(growth)
     n = len(truth)
     before = np.linalg.norm((estimate - truth)[:, :3, 3], axis=1)
-    # The last keyframe is where the first is, and its unit is growth^n smaller.
+    # The last keyframe is at the position of the first one. Its unit is smaller by growth^n.
     T = inverse(truth[0]) @ truth[-1]
     graph = chain(estimate, T, growth ** -(n - 1))
     start = inverses(graph.T_cw)
@@ -112,10 +112,9 @@ def test_a_lap_whose_scale_drifted_closes():
 
 
 def test_where_tracking_was_lost_the_error_of_a_lap_spreads_if_the_camera_drove_on():
-    """Tracking is lost half-way.
+    """Tracking is lost half-way, and the unit changes by a third.
 
-    The unit changes by a third, and the predicted motion in the gap is too short and has a wrong
-    direction.
+    The predicted motion in the gap is too short and has a wrong direction.
     """
     growth, after = 1.004, 60
     truth, estimate = drifted_lap(growth)
@@ -134,7 +133,7 @@ def test_where_tracking_was_lost_the_error_of_a_lap_spreads_if_the_camera_drove_
         unit = np.linalg.norm(np.diff(found[:, :3, 3], axis=0), axis=1)
         unit /= np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)
         worst[kind] = np.abs(np.log(np.delete(unit, after))).max()
-    # Nothing spreads over a gap of which nothing is known: half a lap keeps its wrong unit.
+    # If the motion in the gap is unknown, nothing is distributed: half a lap keeps its wrong unit.
     assert worst[GAP] < 0.15
     assert worst[WEAK] > 0.23
 
@@ -212,7 +211,7 @@ def test_a_correction_leaves_every_keyframe_its_picture():
         ids = map_.landmarks_of(k)
         away = np.linalg.norm(a.xyz[ids] - inverse(a.T_cw[k])[:3, 3], axis=1)
         np.testing.assert_allclose(a.distance_range[ids, 1], away)
-    # A culled keyframe keeps its place beside the one that took its place.
+    # A culled keyframe keeps its pose relative to the keyframe that replaced it.
     np.testing.assert_allclose(map_.keyframes.T_c_parent[1][:3, 3], 1.5 * offset[:3, 3])
     np.testing.assert_allclose(map_.unit_scale, [1.5, 1.5, 0.5])
 

@@ -33,10 +33,7 @@ LOADS = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link"
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site, which is built from a copy as ``make docs`` builds it.
-
-    A copy is used because the build writes pages next to the others.
-    """
+    """The site, which is built from a copy, because the build adds pages to docs/."""
     root = tmp_path_factory.mktemp("site")
     for name in ("docs", "loopclosure", "tools"):
         shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -214,9 +211,9 @@ next();
 
 @pytest.mark.slow
 def test_pages_in_a_browser_as_wide_as_a_phone(site: Path, tmp_path: Path):
-    """In Chromium at a width of 400 px, nothing is wider than the page.
+    """At a width of 400 px, nothing is wider than the page, and letters are large enough.
 
-    Letters are large enough. The pages request nothing from other hosts.
+    The pages request nothing from other hosts.
     """
     chromium()
     shown = ["index", "tutorial/first_run", "reference/commands", "reference/thresholds",

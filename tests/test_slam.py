@@ -23,7 +23,7 @@ from vslam.slam import Slam
 
 ORB = OrbConfig(n_features=800)
 CONFIG = Config(orb=ORB)
-# A keyframe at every frame keeps mapping and merging busy.
+# With a keyframe at every frame, mapping and merging never pause.
 EAGER = Config(orb=ORB, keyframes=KeyframeConfig(max_interval_s=0.05))
 
 
@@ -37,7 +37,6 @@ def run(
     left_black: Iterable[int] = (),
     skipped: Iterable[int] = (),
 ) -> tuple[Slam, list[TrackResult]]:
-    """Track some frames. Some of them may be black or missing."""
     slam = Slam(sequence.camera, config, "none", threads=threads)
     results = []
     nothing = np.zeros_like(sequence.left[0])
@@ -54,10 +53,7 @@ def run(
 
 
 def position_errors(slam: Slam, sequence, frames=slice(None)) -> np.ndarray:
-    """Return the position errors in metres without alignment.
-
-    The first frame is the world frame of both trajectories.
-    """
+    """Return the position errors in metres, in the world frame of the first frame."""
     return np.linalg.norm(slam.trajectory().T_wc[:, :3, 3] - sequence.T_wc[frames, :3, 3], axis=1)
 
 
@@ -93,7 +89,7 @@ def test_tracks_every_frame_to_centimetres(corridor, check_map):
 
 
 def test_while_the_left_side_is_black_the_right_one_tracks(corridor, check_map):
-    """If the pose were that of the right camera, it would be wrong by more than half a baseline."""
+    """The pose of the right camera would be wrong by more than half a baseline."""
     dark = range(10, 16)
     slam, results = run(corridor, EAGER, left_black=dark)
     assert states(results) == "O" * len(corridor)
@@ -110,10 +106,7 @@ def test_while_the_left_side_is_black_the_right_one_tracks(corridor, check_map):
     ("threads", "said"), [(1, "every frame was tracked"), (2, "create it after the fork")]
 )
 def test_a_fork_tracks_with_one_thread_and_is_refused_with_more(corridor, threads, said):
-    """In a fork, no thread would work on the copy of the map.
-
-    A fork with several threads would wait forever.
-    """
+    """In a fork, no thread would work on the copy of the map. The fork would wait forever."""
     slam = Slam(corridor.camera, EAGER, "none", threads=threads)
 
     def go_on(frames: range) -> None:
@@ -137,7 +130,7 @@ def test_a_fork_tracks_with_one_thread_and_is_refused_with_more(corridor, thread
     finally:
         process.kill()
         process.join()
-    go_on(range(6, 12))  # the parent's is as it was
+    go_on(range(6, 12))  # the map of the parent has not changed
 
 
 def test_results_account_for_every_frame(corridor):
@@ -170,7 +163,7 @@ def test_landmarks_lie_on_the_walls_and_the_ground(corridor):
     x, y, z = slam.map.arrays.xyz[slam.map.living_landmarks()].T
     assert len(x) > 500
     distance = np.min([np.abs(y - 1.5), np.abs(x + 4.0), np.abs(x - 4.5), np.abs(z - 32.0)], axis=0)
-    assert np.median(distance) < 0.08  # metres; far points of coarse octaves count as much
+    assert np.median(distance) < 0.08  # metres; far points of coarse octaves are included
     assert np.mean(distance < 0.3) > 0.8
 
 
@@ -191,10 +184,7 @@ def test_two_in_threads_of_their_own_have_the_bytes_of_one(corridor):
 @pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, monkeypatch):
-    """Mapping runs either as late as possible (when its result is merged) or as early as possible.
-
-    A race condition would lead to different results.
-    """
+    """Mapping runs as early or as late as possible. A race would lead to different results."""
     late = bytes_of(*run(corridor, config, threads=1))
     monkeypatch.setattr("vslam.slam.Workers", InstantWorkers)
     assert bytes_of(*run(corridor, config, threads=2)) == late
@@ -228,10 +218,10 @@ def test_the_pose_is_known_before_a_frame_becomes_a_keyframe(corridor):
             corridor.left[:6], corridor.right[:6], corridor.timestamps[:6], strict=True
         )
     ]
-    assert [n for _, n in known] == [1, 1, 2, 3, 4, 5]  # keyframes before that of the frame
+    assert [n for _, n in known] == [1, 1, 2, 3, 4, 5]  # keyframes merged so far
     for (first, _), result in zip(known[1:], results[1:], strict=True):
         assert (first.is_keyframe, result.is_keyframe) == (False, True)
-        # The insertion merges the keyframe before, which may move the frame a little.
+        # The insertion merges the previous keyframe, which may move the frame slightly.
         np.testing.assert_allclose(first.T_wc, result.T_wc, atol=0.02)
 
 
@@ -265,7 +255,7 @@ def test_counters_of_landmarks_stay_in_order(corridor):
     assert np.mean(a.found[living] <= a.visible[living]) > 0.99
 
 
-# -- trouble --------------------------------------------------------------------------------------
+# -- faults ---------------------------------------------------------------------------------------
 
 
 def test_black_frames_are_lost_at_the_predicted_pose_and_tracking_recovers(corridor):
@@ -278,7 +268,7 @@ def test_black_frames_are_lost_at_the_predicted_pose_and_tracking_recovers(corri
             0,
             False,
         )
-    # Constant velocity: 0.35 m a frame along a gentle curve.
+    # The camera moves by 0.35 m per frame along a gentle curve.
     np.testing.assert_allclose(
         [r.T_wc[:3, 3] for r in results[12:15]], corridor.T_wc[12:15, :3, 3], rtol=0, atol=0.15
     )
@@ -298,7 +288,7 @@ def test_a_black_frame_soon_after_a_keyframe_does_not_move_the_frame_before(corr
     for k in range(black):
         slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
     last = slam.frame
-    for k in (black, black + 1):  # two, so that the merge is behind us
+    for k in (black, black + 1):  # two frames, so that the merge is done
         slam.step(nothing, nothing, corridor.timestamps[k])
     assert slam.frame is last
     slam.finish()
@@ -308,14 +298,11 @@ def test_a_black_frame_soon_after_a_keyframe_does_not_move_the_frame_before(corr
 
 @pytest.mark.parametrize(("young", "lost"), [(0, 4), (20, 1)])
 def test_lost_for_long_mapping_restarts_at_the_predicted_pose(corridor, check_map, young, lost):
-    """Mapping restarts after a number of lost frames.
-
-    If the map has only just begun, it restarts after one lost frame.
-    """
+    """If the map has only just begun, mapping restarts after one lost frame."""
     tracking = TrackingConfig(lost_frames_before_restart=4, young_keyframes=young)
     config = Config(orb=ORB, tracking=tracking)
-    # From frame 10 on the camera is elsewhere: the images of the corridor run backwards, upside
-    # down, so that nothing can be recognised.
+    # From frame 10, the images of the corridor are in reverse order and upside down, so that
+    # nothing can be recognised.
     frames = list(range(20))
     slam = Slam(corridor.camera, config, "none", threads=1)
     results = []
@@ -329,7 +316,7 @@ def test_lost_for_long_mapping_restarts_at_the_predicted_pose(corridor, check_ma
     assert states(results[10:]) == "L" * lost + "O" * (10 - lost)
     assert [r.is_keyframe for r in results[10 : 10 + lost]] == [False] * (lost - 1) + [True]
     T_wc = slam.trajectory().T_wc
-    # Still 0.35 m a frame, seen from the prediction.
+    # The motion is still 0.35 m per frame, relative to the prediction.
     steps = np.linalg.norm(np.diff(T_wc[9 + lost :, :3, 3], axis=0), axis=1)
     np.testing.assert_allclose(steps, 0.35, rtol=0, atol=0.05)
     check_map(slam.map)
@@ -355,10 +342,7 @@ def test_starts_with_the_first_frame_that_shows_something(corridor):
 
 @pytest.mark.parametrize("first", [0, 2])
 def test_a_start_at_speed_is_tracked_by_far_points(corridor, check_map, first):
-    """The camera moves 2.8 m per frame from the first frame.
-
-    Therefore, near points leave the view at once.
-    """
+    """The camera moves 2.8 m per frame, so that near points leave the view at once."""
     frames = range(first, 28, 8)
     slam, results = run(corridor, frames=frames)
     assert states(results) == "O" * len(frames)
@@ -415,10 +399,7 @@ def test_nothing_at_all(corridor):
 
 
 def test_dropped_frames_do_not_disturb_the_prediction(corridor):
-    """The velocity is per second.
-
-    Therefore, the motion over a gap of two frames is predicted as that of two frames.
-    """
+    """The velocity is per second. A gap of two frames is predicted as two frames of motion."""
     frames = [k for k in range(len(corridor)) if k not in (7, 14, 15, 21)]
     slam, results = run(corridor, frames=frames)
     assert states(results) == "O" * len(frames)
@@ -526,10 +507,7 @@ class Onlooker(NoDetector):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_caller_may_write_the_next_images_into_the_same_arrays(corridor, threads):
-    """Many camera loops do this.
-
-    A detector in the mapping thread must still see the image of the keyframe.
-    """
+    """A detector in the mapping thread must still see the image of the keyframe."""
     onlooker = Onlooker()
     slam = Slam(corridor.camera, EAGER, onlooker, threads=threads)
     left, right = np.empty_like(corridor.left[0]), np.empty_like(corridor.right[0])
@@ -555,10 +533,7 @@ def test_the_capsule_network_beside_the_bag_of_words_is_the_default(corridor):
 def test_a_keyframe_that_cannot_be_mapped_is_the_last_thing_that_happens(
     corridor, monkeypatch, tmp_path
 ):
-    """The step that merges the keyframe raises an error.
-
-    After that, the incomplete map is not used.
-    """
+    """The step that merges it raises an error. After that, the incomplete map is not used."""
     slam = Slam(corridor.camera, EAGER, "none", threads=1)
 
     def drive(frames: range) -> None:

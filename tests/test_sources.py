@@ -1,7 +1,4 @@
-"""Folders, videos, bags and cameras.
-
-The same frames give the same run from every kind of source.
-"""
+"""Folders, videos, bags and cameras: the same frames give the same run from every source."""
 
 from __future__ import annotations
 
@@ -140,7 +137,6 @@ def test_a_bag_in_real_time_has_every_frame(folder):
 
 @pytest.mark.parametrize("kind", ["images", "video", "bgr8", "rgb8", "png"])
 def test_colours(corridor, tmp_path, kind):
-    """Colour images are read as they were taken. The grey images do not change."""
     tinted = [np.dstack([image, image // 2, 255 - image]) for image in corridor.left[:3]]
     calib = write_calibration(tmp_path / "left.yaml", corridor.camera, mono=True)
     options = SourceOptions(calib=(calib,), sensor="mono")
@@ -245,10 +241,7 @@ def test_times_in_exif(corridor, tmp_path):
 
 
 def test_an_image_too_large_for_pillow_has_no_time_in_exif(tmp_path):
-    """Above 179 million pixels, Pillow raises an error of its own.
-
-    It does so even if only the EXIF data are read.
-    """
+    """Above 179 million pixels, Pillow raises its own error, even if only EXIF data are read."""
     for k in range(2):
         (tmp_path / f"IMG_{k}.png").write_bytes(png(20_000, 20_000))
     calib = write_calibration(tmp_path / "c.yaml", Camera(60.0, 60.0, 31.5, 23.5, 0.2, 64, 48))
@@ -291,7 +284,7 @@ def test_a_camera_at_a_url(folder, served):
     assert source.live
     assert source.n_expected is None
     outcome = run_source(source, realtime=True)
-    assert len(outcome.tracks) == FRAMES - 1  # the first image has told the size
+    assert len(outcome.tracks) == FRAMES - 1  # the first image was used to find the image size
     assert "stopped after 11 images" in outcome.interrupted
     assert np.all(np.diff(outcome.trajectory.timestamps) > 0)
     assert abs(outcome.trajectory.timestamps[0] - time.monotonic()) < 60.0
@@ -362,10 +355,7 @@ def test_a_contact_sheet_of_a_video(folder, tmp_path):
 
 @pytest.mark.slow
 def test_a_stress_test_of_a_video(folder, tmp_path):
-    """The runs read the video with the options of the command.
-
-    Perturbations that need later frames are left out.
-    """
+    """Perturbations that need later frames are left out."""
     words = ["stress", folder / "pair.mkv", "--side-by-side", "--calib", folder / "stereo.yaml"]
     words += ["--laws", "bias,desync", "--detectors", "none", "--seeds", "1", "--steps", "1"]
     words += ["--max-frames", "8", "--out", tmp_path / "stress"]
@@ -399,10 +389,7 @@ def test_a_sequence_written_side_by_side_comes_back(kitti_tree, tmp_path):
 
 
 class There:
-    """The corridor forwards and backwards as a stream.
-
-    It counts the images that are held in memory.
-    """
+    """The corridor forwards and backwards as a stream. Images in memory are counted."""
 
     def __init__(self, corridor):
         self.corridor = corridor

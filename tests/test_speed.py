@@ -26,10 +26,7 @@ RATIO_MEASURED = 0.56  # frames tracked and mapped on two Xeon cores with AVX-51
 
 @kernel
 def fixed_work(image, out):
-    """Compute the sum of a star of nine pixels for every pixel, 20 times.
-
-    The work consists of loads, integer sums and stores.
-    """
+    """Compute the sum of a star of nine pixels for every pixel, 20 times."""
     height, width = image.shape
     for _ in range(20):
         for y in range(2, height - 2):
@@ -42,10 +39,7 @@ def fixed_work(image, out):
 
 
 def least_in_turn(*calls: Callable[[], object]) -> list[float]:
-    """Return the least CPU time of each call in seconds.
-
-    The first round compiles and is not counted.
-    """
+    """Return the least CPU time of each call in seconds. The first round compiles."""
     taken = np.empty((REPEATS + 1, len(calls)))
     for repeat in range(REPEATS + 1):
         for number, call in enumerate(calls):
@@ -66,6 +60,6 @@ def test_a_frame_tracked_and_mapped(corridor):
             slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
         slam.finish()
 
-    cv2.setNumThreads(1)  # what other threads do is not counted
+    cv2.setNumThreads(1)  # the time of other threads would not be counted
     fixed, driven = least_in_turn(lambda: fixed_work(image, out), drive)
     assert driven / fixed / len(corridor.left) < 10 * RATIO_MEASURED

@@ -81,7 +81,7 @@ def test_two_views_from_different_places_begin_a_map():
     truth[:3, 3] *= unit
     np.testing.assert_allclose(start.T_2_1, truth, atol=1e-3)
     np.testing.assert_allclose(start.twist, se3_log(start.T_2_1) / 0.5)
-    assert one.is_waiting  # until it is told that the map has begun
+    assert one.is_waiting  # until the map has begun
     one.reset()
     assert not one.is_waiting
 
@@ -146,7 +146,6 @@ def test_a_map_needs_enough_points_to_begin_with(min_landmarks, enough):
 
 
 def two_views() -> TwoViewStart:
-    """Make a start in which the camera moves by 0.5 units in 0.25 s."""
     T_2_1 = se3_exp(np.array([0.3, 0.0, 0.4, 0.0, 0.02, 0.0]))
     T_2_1[:3, 3] *= 0.5 / np.linalg.norm(T_2_1[:3, 3])
     features = np.arange(240), np.arange(240)
@@ -154,10 +153,7 @@ def two_views() -> TwoViewStart:
 
 
 def test_a_sub_map_takes_its_unit_from_the_speed_before():
-    """At 6 units per second, the camera moves by 1.5 units in 0.25 s.
-
-    This is three times the motion of the start.
-    """
+    """At 6 units per second, the camera moves by 1.5 units in 0.25 s: three times the start."""
     start = two_views()
     rescaled = start.at_speed(np.array([0.0, 3.6, 4.8, 0.1, 0.0, 0.0]), 10.0)
     assert rescaled.predicted
@@ -169,17 +165,14 @@ def test_a_sub_map_takes_its_unit_from_the_speed_before():
     assert rescaled.first is start.first
     assert rescaled.second is start.second
     np.testing.assert_allclose(se3_exp(0.25 * rescaled.twist), rescaled.T_2_1, atol=1e-12)
-    assert np.linalg.norm(start.T_2_1[:3, 3]) == pytest.approx(0.5)  # as it was
+    assert np.linalg.norm(start.T_2_1[:3, 3]) == pytest.approx(0.5)  # unchanged
 
 
 @pytest.mark.parametrize(("speed", "believed"), [
     (19.9, True), (20.1, False), (0.201, True), (0.199, False), (0.0, False),
 ])  # fmt: skip
 def test_a_speed_that_asks_for_too_much_rescaling_tells_nothing(speed, believed):
-    """The speed of the start is 2 units per second.
-
-    The limits are ten times this speed and a tenth of it.
-    """
+    """The limits are ten times the speed of the start (2 units per second) and a tenth of it."""
     start = two_views()
     rescaled = start.at_speed(np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0]), 10.0)
     assert rescaled.predicted == believed

@@ -37,10 +37,7 @@ def extracted(image: np.ndarray) -> Extraction:
 def match(
     dx: float, dy: float = 0.0, fx: float = 240.0, noise: float = 0.0
 ) -> tuple[Extraction, np.ndarray]:
-    """Match a plane at disparity ``dx``.
-
-    Return its left features and the disparities that are found.
-    """
+    """Match a plane at disparity ``dx``. Return its left features and the disparities found."""
     image = texture()
     rng = np.random.default_rng(9)
     left = extracted(image + noise * rng.normal(size=image.shape))
@@ -60,7 +57,7 @@ def seen_by_both(left: Extraction, dx: float) -> np.ndarray:
 def test_integer_disparity(disparity):
     left, found = match(disparity, noise=1.0)
     matched = np.isfinite(found)
-    # The coarser levels are sampled at other phases; the median of SAD rejects many of them.
+    # Coarser levels are sampled at other phases. The median of the SAD rejects many of them.
     assert matched[(left.octave == 0) & seen_by_both(left, disparity)].mean() > 0.6
     error = np.abs(found[matched] - disparity)
     assert np.median(error[left.octave[matched] == 0]) < 0.05
@@ -80,10 +77,7 @@ def test_sub_pixel_disparity(disparity):
 
 
 def test_sub_pixel_offsets_follow_the_shift():
-    """The shifts differ by a quarter of a pixel.
-
-    If disparities were rounded to whole pixels, they would differ by 0 or 1.
-    """
+    """The shifts differ by a quarter of a pixel, which rounding to whole pixels would hide."""
     medians = []
     for dx in (8.0, 8.25, 8.5, 8.75):
         left, found = match(dx)

@@ -53,7 +53,6 @@ def report_of(cell: Cell, **figures: object) -> ReportJson:
 
 
 def searched(fails, steps: int = 5) -> tuple[list[float], dict[float, str]]:
-    """Run a bisection against ``fails(position)``."""
     verdicts: dict[float, str] = {}
     order = []
     while (position := next_position({p: bool(v) for p, v in verdicts.items()}, steps)) is not None:
@@ -192,7 +191,7 @@ def conducted(out: Path, plan: Plan = PLAN):
 def test_searches_find_the_boundaries_of_every_system_and_seed(tmp_path):
     world, report = conducted(tmp_path)
     assert [cell.perturb for cell in world.ran[:2]] == ["none", "none"]
-    # A law that draws nothing is searched once for a system that repeats itself.
+    # If neither the perturbation nor the system is random, there is only one search.
     counts = {
         (law, system): sum((e.law, e.system) == (law, system) for e in report.boundaries)
         for law in PLAN.laws
@@ -214,7 +213,7 @@ def test_searches_find_the_boundaries_of_every_system_and_seed(tmp_path):
 def test_a_stress_test_goes_on_where_it_was_stopped_with_equal_bytes(tmp_path):
     first, report = conducted(tmp_path)
     again, same = conducted(tmp_path)
-    assert {cell.detector for cell in again.ran} == {"other"}  # those that failed are tried again
+    assert {cell.detector for cell in again.ran} == {"other"}  # failed runs are tried again
     assert len(again.ran) < len(first.ran) / 2
     assert same.model_dump_json() == report.model_dump_json()
 
@@ -321,7 +320,7 @@ def test_a_seed_that_ends_with_an_error_counts_against_its_system():
 
     with_law = [entry for entry in corruption_entries(cells, reports, "bow") if entry.specs]
     drawn = [one for one in with_law if one.ate_sum_m["bow"] is None]
-    assert drawn  # laws that draw random numbers run with both seeds
+    assert drawn  # random perturbations are run with both seeds
     assert all(one.ate_sum_m["bow"] == pytest.approx(1.0) for one in with_law if one not in drawn)
 
 
@@ -334,7 +333,7 @@ def test_laws_are_named_without_strengths():
         parse_laws(" ,")
 
 
-# Another system: a script that drives straight ahead, or does what the test says.
+# Another system: a script whose camera moves straight ahead, or that does what the test needs.
 
 CAMERA = Camera(100.0, 100.0, 32.0, 24.0, 0.5, 64, 48)
 
@@ -408,7 +407,7 @@ rows = [f"{t} {0.1 * (i % 3)} 0 {i} 0 0 0 1" for i, t in enumerate(times) if i n
 """
     report = run_script(make_kitti(tmp_path), tum)
     assert report.lost_frames == 2
-    assert 0.0 < report.ate_rmse_m < 0.1  # bridged
+    assert 0.0 < report.ate_rmse_m < 0.1  # unknown poses are interpolated
 
 
 def test_states_and_causal_poses_of_another_system_count(tmp_path):
@@ -489,7 +488,7 @@ rows = [f"1 0 0 {0.1 * (i % 3) + far * (i % 2)} 0 1 0 0 0 0 1 {i}" for i in k]
     assert done.exit_code == 0, done.output
     report = json.loads((tmp_path / "out" / "stress.json").read_text())
     (entry,) = report["boundaries"]
-    assert entry["holds_to"] is None  # 2.5 stops less: mean 23 of 128
+    assert entry["holds_to"] is None  # 2.5 stops darker, which is a mean of 23 instead of 128
     assert entry["fails_at"] == 2.5
     assert entry["reason"].startswith("ATE")
     first = (tmp_path / "out" / "stress.json").read_bytes()

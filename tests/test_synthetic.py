@@ -41,7 +41,7 @@ from vslam.lab.loopbench.drives import render_views
 CAMERA = Camera(360.0, 360.0, 300.3, 95.7, 0.54, 620, 190)
 BY_DAY = Light(np.array([0.0, -0.8, -0.6]), visibility=1e9, haze=0.0)
 SIDE = 1024
-DOTS = 8  # a row and a column
+DOTS = 8  # in each row and column
 
 
 def straight(n=64, step=1.0):
@@ -63,10 +63,7 @@ def town(route):
 
 
 def dotted_world():
-    """Make a slanted wall with bright dots before grey ground.
-
-    Also return the dots in world coordinates.
-    """
+    """Make a slanted wall with bright dots before grey ground, and the positions of the dots."""
     y, x = np.mgrid[0:SIDE, 0:SIDE] + 0.5
     pitch = SIDE / DOTS
     from_dot = ((x % pitch) - pitch / 2) ** 2 + ((y % pitch) - pitch / 2) ** 2
@@ -102,7 +99,6 @@ def draw(surfaces, atlas, sky, T_wc, threads=1):
 
 
 def centroids(image, near):
-    """Return the centroids of bright dots close to the places ``near``."""
     found = []
     for u, v in near:
         c, r = round(u), round(v)
@@ -196,10 +192,7 @@ def test_shadow_falls_away_from_the_sun():
 
 @pytest.fixture
 def unpainted(monkeypatch):
-    """Make towns with the real geometry, but with textures that need no time.
-
-    Their ground is far below.
-    """
+    """Make towns with the real geometry, but with textures that need no time and deep ground."""
     plain = np.full((2, 2), 99.0, np.float32)
     twice = (plain, plain)
     for module, names, value in (
@@ -407,11 +400,11 @@ def test_damaged_frames_are_found_and_rendered_again(tmp_path, monkeypatch, capl
     monkeypatch.setattr(store, "render_frames", fake := Renderings())
     root = store.render_sequence(small, Variation(), tmp_path)
     images = root / "sequences/short/image_0"
-    (images / "000007.png").write_bytes(b"pn")  # another size
+    (images / "000007.png").write_bytes(b"pn")  # a file of a different size
     store.render_sequence(small, Variation(), tmp_path)
     assert (fake.calls, fake.missing) == (2, [7])
     assert "rendering 1 damaged frame again: 7" in caplog.text
-    (images / "000008.png").write_bytes(b"xxx")  # the same size
+    (images / "000008.png").write_bytes(b"xxx")  # a file of the same size
     store.render_sequence(small, Variation(), tmp_path)
     assert fake.calls == 2
     store.render_sequence(small, Variation(), tmp_path, verify=True)
@@ -440,7 +433,7 @@ def test_two_processes_do_not_render_one_sequence(tmp_path, monkeypatch):
         pytest.raises(InputError, match="another process is rendering it; wait"),
     ):
         store.render_sequence(small, Variation(), tmp_path)
-    (folder / ".short.lock").touch()  # killed long ago
+    (folder / ".short.lock").touch()  # left by a killed process
     store.render_sequence(small, Variation(), tmp_path)
     assert fake.calls == 1
     assert not list(folder.glob(".short*"))
@@ -507,7 +500,6 @@ def test_lamps_cast_pools():
 
 
 def rounds(n, radius=32.0, laps=1.6):
-    """Return the poses of a drive around a circle."""
     angle = np.linspace(0, 2 * np.pi * laps, n)
     T = np.stack([turn(a) for a in angle])
     T = np.concatenate([T, np.zeros((n, 3, 1))], axis=2)

@@ -21,8 +21,8 @@ CONTEXT = TrackingContext.create(CAMERA, Config())
 POINTS = Points.create()
 SEEN_LAST, SEEN_NOW = slice(0, 120), slice(120, 240)  # two halves of the points
 FEW = slice(0, 60)
-STEP = np.array([0.02, 0.0, -0.8, 0.0, -0.004, 0.0])  # of the camera, between two frames
-TWIST = STEP / 0.1  # at ten frames a second
+STEP = np.array([0.02, 0.0, -0.8, 0.0, -0.004, 0.0])  # motion of the camera between two frames
+TWIST = STEP / 0.1  # at ten frames per second
 
 
 def at(k: float) -> np.ndarray:
@@ -31,14 +31,13 @@ def at(k: float) -> np.ndarray:
 
 
 def restored(tracker: Tracker) -> Tracker:
-    """Return a new tracker in the same map, which has the memory of the given tracker."""
+    """Return a new tracker in the same map with the memory of the given tracker."""
     state, other = tracker.state(), Tracker(CONTEXT)
     other.restore(state, np.where((state.landmark >= 0)[:, None], POINTS.xyz, np.nan))
     return other
 
 
 def select(features: Features, n: int) -> Features:
-    """Return the first n features."""
     names = ("xy", "octave", "angle", "descriptors", "u_right")
     return Features(*(getattr(features, name)[:n] for name in names))
 
@@ -55,7 +54,7 @@ class Drive:
 
     @classmethod
     def of_two_frames(cls, among: slice = ALL) -> Drive:
-        """Return a drive of two frames, so that the speed of the camera is known.
+        """Make a drive of two frames, so that the speed of the camera is known.
 
         The last frame saw some of the points.
         """
@@ -65,10 +64,7 @@ class Drive:
         return drive
 
     def accept(self, k: int, among: slice = ALL, *, keyframe: int = -1) -> Frame:
-        """Continue from a frame that was found.
-
-        ``keyframe`` is given if it was found by relocalisation.
-        """
+        """Continue from a frame that was found, with a ``keyframe`` if by relocalisation."""
         frame = POINTS.tracked_frame(len(self.frames), 0.1 * k, at(k), among)
         found = Found(TrackingState.OK, keyframe=keyframe)
         if k == 0:
@@ -79,7 +75,7 @@ class Drive:
         return frame
 
     def lose(self, k: int) -> None:
-        """Return a frame that is not tracked, at its predicted pose."""
+        """Continue from a frame that is not tracked, at its predicted pose."""
         T_cw = self.predict(k)
         self.frames.append(0.1 * k, T_cw, tracked=False)
         self.tracker.lose()
@@ -132,7 +128,7 @@ def test_the_camera_moves_on_while_it_is_lost():
 
 
 def test_the_speed_is_measured_from_the_last_frame_that_was_tracked():
-    """Predicted poses are not used. Here, they are the poses of a camera that stands still."""
+    """The predicted poses, which are not used, are those of a camera that stands still."""
     drive = Drive()
     drive.accept(0)
     drive.lose(1)
@@ -149,7 +145,7 @@ def test_the_leap_to_where_a_frame_was_found_in_the_map_is_no_motion():
     assert drive.tracker.twist is None
 
 
-# -- what tracking goes on ------------------------------------------------------------------------
+# -- what is tracked ------------------------------------------------------------------------------
 
 
 def test_a_tracker_that_has_nothing_to_go_on_does_not_track():
@@ -177,7 +173,7 @@ def test_a_continued_drive_has_the_speed_that_it_is_told():
     drive.frames.append(0.0, at(0), tracked=True)
     drive.tracker.resume(TWIST)
     np.testing.assert_allclose(drive.predict(3), at(3), atol=1e-12)
-    # With it, a frame that the reference keyframe does not show is found at the prediction.
+    # With the prediction, a frame is found that the reference keyframe does not show.
     frame, view = drive.next_frame(), POINTS.view(nearest=NOTHING)
     assert drive.track(frame, view).n_inliers == 240
     drive.tracker.resume(None)
@@ -186,10 +182,9 @@ def test_a_continued_drive_has_the_speed_that_it_is_told():
 
 @pytest.mark.parametrize(("pixels", "found_again"), [(12, True), (200, False)])
 def test_what_the_last_frame_saw_is_looked_for_near_the_prediction(pixels, found_again):
-    """The points are 12 pixels away.
+    """12 pixels are too far for the window around landmarks of the map.
 
-    This is too far for the window around landmarks of the map. The reference keyframe has no
-    matches here.
+    The reference keyframe has no matches here.
     """
     drive, view = Drive.of_two_frames(), POINTS.view(nearest=NOTHING)
     frame = drive.next_frame()
@@ -218,10 +213,7 @@ def test_where_the_last_frame_shows_other_things_the_reference_keyframe_is_tried
 def test_where_neither_is_recognised_all_around_is_looked_for_near_the_prediction(
     pixels, found_again
 ):
-    """The window has 7 pixels, or 11 if a landmark is seen from the side.
-
-    Usually, it has 2.5 or 4 pixels.
-    """
+    """The window has 7 pixels, or 11 if a landmark is seen from the side, instead of 2.5 or 4."""
     drive, view = Drive.of_two_frames(SEEN_LAST), POINTS.view(nearest=SEEN_LAST)
     frame = drive.next_frame(SEEN_NOW)
     found = drive.track(frame, view, ahead(0.0, pixels / CAMERA.fx) @ at(2))
@@ -244,10 +236,7 @@ def test_a_prediction_with_few_inliers_is_not_trusted(last_saw, n_inliers, found
 @pytest.mark.parametrize("last_saw", [SEEN_LAST, ALL], ids=["predicted", "motion"])
 @pytest.mark.parametrize(("n_wrong", "found_again"), [(70, True), (71, False)])
 def test_a_prediction_with_a_small_share_of_inliers_is_not_trusted(last_saw, n_wrong, found_again):
-    """30 points are at their predicted positions.
-
-    70 or 71 points are six pixels away from theirs.
-    """
+    """30 points are at their predicted positions. 70 or 71 points are six pixels away."""
     drive, view = Drive.of_two_frames(last_saw), POINTS.view(nearest=NOTHING)
     features = POINTS.see(at(2), slice(139, 240))
     features.xy[30 : 30 + n_wrong, 1] += np.where(np.arange(n_wrong) % 2, 6.0, -6.0)
@@ -330,7 +319,7 @@ def test_a_small_share_of_inliers_makes_a_frame_of_a_depth_camera_lost(n_inliers
 
 # -- doubt ----------------------------------------------------------------------------------------
 
-OLD, YOUNG = 6, 5  # keyframes: a map of five is young
+OLD, YOUNG = 6, 5  # numbers of keyframes; a map with five is young
 
 
 def test_a_frame_after_a_gap_with_few_inliers_is_doubtful():
@@ -364,7 +353,7 @@ def test_a_frame_with_few_inliers_next_to_one_found_in_the_map_is_doubtful():
     assert drive.doubts(frame, POINTS.view(n_reference=121, n_keyframes=OLD))
     assert not drive.doubts(frame, POINTS.view(n_reference=120, n_keyframes=OLD))
     assert not drive.doubts(frame, POINTS.view(n_reference=121, n_keyframes=YOUNG))
-    drive.accept(4, FEW)  # from here on the motion is known
+    drive.accept(4, FEW)  # now the motion is known
     assert not drive.doubts(drive.next_frame(FEW), POINTS.view(n_reference=121, n_keyframes=OLD))
 
 

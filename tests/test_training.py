@@ -49,7 +49,7 @@ def test_a_share_of_what_was_learned_is_kept(tmp_path):
     whole = settings.model_copy(update={"learned_share": 1.0})
     for name, each in (("whole", whole), ("share", settings)):
         train(collection, each, tmp_path / name, start=small_network(1), threads=1)
-    # Decided after the end, and once only.
+    # The decision is made once, after the end.
     for _ in range(2):
         train(
             collection, settings, tmp_path / "whole", start=small_network(1), threads=1, resume=True
@@ -99,7 +99,7 @@ def test_64_pairs_are_learned_by_heart(tmp_path, loss, epochs, mixed):
     assert pairs.same.sum() == 32
     learned = precision_recall(pairs.same, score[pairs.a, pairs.b])
     assert average_precision(learned) == 1.0
-    assert outcome.figures["average_precision"] > 0.9  # of places it never saw
+    assert outcome.figures["average_precision"] > 0.9  # on places that are not in the training data
 
 
 @pytest.mark.slow
@@ -132,7 +132,7 @@ def test_a_resumed_training_has_the_bits_of_an_uninterrupted_one(tmp_path):
 
     def killed_in_the_middle() -> bool:
         steps.append(1)
-        return len(steps) in (1, 3)  # in the first epoch and, resumed, in the second
+        return len(steps) in (1, 3)  # in the first epoch, and in the second one after resuming
 
     parts = tmp_path / "parts"
     for finished in (False, False, True):
@@ -228,7 +228,7 @@ def test_a_network_goes_on_with_larger_images(tmp_path):
     x = to_tensor(collection.images[:4])
     with torch.no_grad():
         assert torch.allclose(same.embed(x), first.eval().embed(x), atol=1e-6)
-    # Gains are interpolated: one that grows along the rows of the small grid does on the large one.
+    # Gains are interpolated: the gain increases along the rows of the large grid, too.
     layer = first.branch.capsules
     side, columns = first.branch.shape.grid
     with torch.no_grad():
@@ -277,7 +277,7 @@ def test_pruning_and_fine_tuning(tmp_path):
     network, _, report = starting_network(smaller, cut, full.weights, "cpu")
     assert network.size == report["resized_to"] == (48, 64)
     assert {"ms_before", "ms_resized", "ms_removed"} <= set(report)
-    # Ranking capsules learns nothing: statistics of normalisations stay as they were trained.
+    # Ranking capsules does not train: the statistics of normalisations do not change.
     before, after = load_network(full.weights)[0].state_dict(), network.state_dict()
     for name in before:
         if "running" in name:

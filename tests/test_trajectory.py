@@ -106,8 +106,8 @@ def test_gaps_are_bridged_at_constant_velocity():
     guessed = np.where(known[:, None, None], T_wc, np.eye(4))
     bridged = bridge_gaps(Trajectory(times, guessed), known)
     np.testing.assert_allclose(bridged.T_wc[:4], T_wc[:4], atol=1e-12)
-    np.testing.assert_array_equal(bridged.T_wc[4], np.eye(4))  # nothing known after it
-    known[0] = False  # nothing known before the second anchor
+    np.testing.assert_array_equal(bridged.T_wc[4], np.eye(4))  # there is no known pose after it
+    known[0] = False  # the first known pose is the fourth
     np.testing.assert_array_equal(
         bridge_gaps(Trajectory(times, guessed), known).T_wc[:3], np.tile(T_wc[3], (3, 1, 1))
     )

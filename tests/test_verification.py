@@ -1,4 +1,4 @@
-"""Loop candidates on a simulated street that is driven twice, with drift between the two passes."""
+"""Loop candidates on a simulated street that is passed twice, with drift between the passes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ DRIFT = se3_exp(np.array([3.0, -0.4, 5.0, 0.02, 0.15, -0.01]))
 
 
 def forward(metres: float, sideways: float = 0.0, yaw: float = 0.0) -> np.ndarray:
-    """Return ``T_cw`` of a camera on the street."""
     return inverse(se3_exp(np.array([sideways, 0.0, metres, 0.0, yaw, 0.0])))
 
 
@@ -51,10 +50,9 @@ def let_drift(world: World, keyframes: range) -> None:
 
 
 def street(among=None, *, mono: bool = False, seed: int = 0, noise: float = 0.5) -> World:
-    """Make a map of a street that was driven twice.
+    """Make a map of a street that was passed twice.
 
-    In the second pass, only the points in ``among`` have the same descriptors. The other points
-    exist, but have new descriptors.
+    In the second pass, the points that are not in ``among`` have new descriptors.
     """
     world = make_world(900, seed=seed)
     for i in range(PASS):
@@ -77,7 +75,6 @@ def check(world: World, config: VerificationConfig = CONFIG, query: int = 6, mat
 
 
 def error(world: World, edge) -> tuple[float, float]:
-    """Return the error of the pose of an edge in metres and in degrees."""
     true = world.truth[edge.query] @ inverse(world.truth[edge.match])
     twist = se3_log(edge.T_query_match @ inverse(true))
     return float(np.linalg.norm(twist[:3])), float(np.degrees(np.linalg.norm(twist[3:])))
@@ -109,7 +106,7 @@ def test_the_matches_of_an_edge_are_right_alive_and_unique():
     shown = world.point_of_row[rows]
     meant = world.point_of_row[a.head[edge.landmarks]]
     assert np.mean(shown == meant) > 0.99
-    # The place is more than the match: seen from further back, its neighbours' landmarks take part.
+    # The place has more landmarks than the match: those of its neighbours are used, too.
     edge = check(world, query=4, match=3)
     assert edge.accepted, edge.reason
     assert np.setdiff1d(edge.landmarks, world.map.landmarks_of(edge.match)).size > 0
@@ -133,7 +130,7 @@ def test_the_map_is_only_read_and_the_answer_is_the_same_again():
 
 
 def test_a_revisit_in_other_light_is_accepted():
-    # 3 of 4 points do not look as before, those that do are all over the street.
+    # Three of four points look different. The other points are distributed over the street.
     world = street(among=np.arange(0, 900, 4))
     edge = check(world)
     assert edge.accepted, edge.reason
@@ -173,7 +170,7 @@ def test_one_object_that_looks_the_same_is_no_revisit(left, right):
     world = street(among=points)
     edge = check(world)
     assert not edge.accepted
-    assert edge.n_inliers >= CONFIG.min_inliers  # enough for ORB-SLAM
+    assert edge.n_inliers >= CONFIG.min_inliers  # ORB-SLAM would accept this number
     assert error(world, edge)[0] < 0.5
     assert "outside one third" in edge.reason or "cells" in edge.reason
 
@@ -183,7 +180,7 @@ def test_what_should_be_seen_and_is_not_speaks_against_a_loop():
     edge = check(world, CONFIG.model_copy(update={"min_seen_ratio": 0.5}))
     assert not edge.accepted
     assert edge.reason.endswith("landmarks of the place are seen")
-    # The other side: a query full of landmarks that the place does not know.
+    # Now the query has many landmarks that the place does not have.
     world = street()
     new = np.flatnonzero(world.map.arrays.landmark[world.map.rows(1)] >= 0)
     rows = new + world.map.arrays.first_row[1]

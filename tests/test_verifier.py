@@ -1,4 +1,4 @@
-"""The verifiers of loop closing: ORB, learned descriptors, and these where ORB fails."""
+"""The verifiers of loop closing: ORB descriptors, and learned descriptors where ORB fails."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_a_failed_attempt_says_all_that_spoke_against_it_and_is_remembered(
     assert other.state() != expected
     other.restore(verifier.state())
     assert other.state() == expected
-    # It rests, and so does the one that was restored.
+    # It pauses, and so does the restored verifier.
     again = LoopCandidate(2, 0, 0.9, similarity=PROMISING.similarity)
     assert [one.rate(by_night.map, 2, [again]) for one in (verifier, other)] == [[again]] * 2
     fresh = kind(CONFIG, CAMERA, KeyframeImages(network))
@@ -156,7 +156,7 @@ def test_candidates_are_rated_by_their_images_within_reach(network, by_night, ki
     (rated,) = kind(config, CAMERA, by_night.images).rate(by_night.map, 1, [unrated])
     assert rated.promising
     assert rated.similarity >= CONFIG.learned.min_similarity
-    # The map has one straight step: by default it puts the place out of reach.
+    # The map has one straight step. By default, the place is then out of reach.
     assert kind(CONFIG, CAMERA, by_night.images).rate(by_night.map, 1, [unrated]) == [unrated]
     blind = kind(config, CAMERA, KeyframeImages(network))
     assert blind.rate(by_night.map, 1, [unrated]) == [unrated]

@@ -42,7 +42,6 @@ def wide_images(n: int, seed: int = 0, width: int = 81) -> torch.Tensor:
 
 
 def wide_views(places: int) -> object:
-    """Make the images of ``views`` with a size of 48x81."""
     collection = views(places)
     resize = [cv2.resize(image, (81, 48)) for image in collection.images]
     return replace(collection, images=np.stack(resize))
@@ -92,7 +91,7 @@ def test_only_lite0_sees_a_little_beyond_a_view(extractor):
     torch.manual_seed(0)
     network = build_network("capsule", SMALL.model_copy(update={"extractor": extractor})).eval()
     for module in network.modules():
-        if isinstance(module, torch.nn.Conv2d):  # torch's start lets what it sees fade away
+        if isinstance(module, torch.nn.Conv2d):  # keeps the response visible
             module.weight *= 2.4
     network = resized(network, Layout((48, 81), 2, 33)).eval()
     x = wide_images(1)
@@ -111,7 +110,7 @@ def test_early_features_of_a_view_lie_where_its_pixels_do():
     whole, alone = extractor.early(x), extractor.early(x[..., 56:313])
     view = whole[..., shape.cuts[1]]
     assert view.shape == alone.shape
-    # What padding reaches differs: 60 pixels at either side.
+    # Padding changes the result within 60 pixels of both sides.
     assert torch.allclose(view[..., 8:-8], alone[..., 8:-8], atol=1e-5)
     assert not torch.allclose(view, alone, atol=1e-5)
     assert torch.equal(extractor.late(whole), extractor(x))
@@ -129,7 +128,7 @@ def test_what_both_cameras_see_is_compared():
     ahead, right = network.embed(world[..., :81]), network.embed(world[..., SHIFT:])
     assert ahead.shape == (1, network.dimensions)
     assert ahead.norm().item() == pytest.approx(1.0, abs=1e-5)
-    # Other alignments of so small a network are nearly as good, and add to it.
+    # Other alignments of such a small network are nearly as good, and contribute.
     assert 1.0 - 1e-5 < network.cosines(ahead, right).item() < 1.0 + 0.04 * np.log(3)
     assert network.cosines(right, ahead).item() == pytest.approx(
         network.cosines(ahead, right).item(), abs=1e-5
@@ -200,10 +199,7 @@ def test_one_against_many_is_pair_by_pair():
 
 
 def lite_network() -> SiameseNetwork:
-    """Make a network with three views.
-
-    Each has 49 of the 81 columns, and they are 16 columns apart.
-    """
+    """Make a network with three views of 49 of the 81 columns, which are 16 columns apart."""
     shape = CapsuleShape(
         extractor="lite0", pixels=48, width=81, views=3, view_width=49, types=4, outputs=4
     )
@@ -265,7 +261,7 @@ def test_networks_for_flat_images_become_those_for_unrolled_ones(tmp_path):
         assert not torch.allclose(flat.embed(x), flat.embed(unrolled), atol=1e-2)
         again = load_network(path)[0]
         assert torch.allclose(again.embed(x), flat.embed(unrolled), atol=1e-5)
-        # What the pruning ranks capsules by.
+        # The measure by which pruning ranks capsules.
         for seen, expected in zip(
             again.branch.routed(x), flat.branch.routed(unrolled), strict=True
         ):

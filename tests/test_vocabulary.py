@@ -33,7 +33,6 @@ def bits(descriptors: np.ndarray) -> np.ndarray:
 
 
 def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return ``(M, N)`` Hamming distances."""
     return (bits(a)[:, None] != bits(b)[None]).sum(axis=2)
 
 
@@ -42,10 +41,7 @@ def random_descriptors(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def noisy(rng: np.random.Generator, centres: np.ndarray, n: int, flips: int) -> np.ndarray:
-    """Return ``n`` copies of each centre, with ``flips`` bits flipped in each copy.
-
-    The copies of a centre follow each other.
-    """
+    """Return ``n`` successive copies of each centre, with ``flips`` bits flipped in each copy."""
     copies = np.repeat(bits(centres), n, axis=0)
     for row in copies:
         row[rng.choice(256, flips, replace=False)] ^= 1
@@ -115,7 +111,7 @@ def test_training_finds_planted_clusters_and_their_centres(seed):
     words = tree.words(data).reshape(8, 60)
     assert (words == words[:, :1]).all(), "a cluster is torn"
     assert len(set(words[:, 0].tolist())) == 8, "two clusters are one"
-    # The majority of 60 copies with each bit turned in few of them is the centre, bit by bit.
+    # The majority of 60 copies, with few flipped bits each, is the centre.
     np.testing.assert_array_equal(
         tree.descriptors[1:][words[:, 0]].view(np.uint8), centres.view(np.uint8)
     )
@@ -260,7 +256,7 @@ def test_an_npz_with_nonsense_inside(small, tmp_path, which):
     parts = parts_of(small)
     n_children, weight = small.n_children.copy(), small.weight.copy()
     if which == "children":
-        n_children[[0, -1]] = 0, n_children[0]  # the root's are given to the last leaf
+        n_children[[0, -1]] = 0, n_children[0]  # the root's children move to the last leaf
     weight[3] = {"negative weight": -1.0, "nan weight": np.nan}.get(which, weight[3])
     np.savez(tmp_path / "v.npz", **(parts | {"n_children": n_children, "weight": weight}))
     with pytest.raises(InputError, match=r"do not form a tree|negative or not finite"):
@@ -302,7 +298,7 @@ def node_line(parent: int, leaf: int, value: int = 0, weight: float = 0.0) -> st
     return f"{parent} {leaf} " + " ".join([str(value)] * 32) + f" {weight}"
 
 
-# Depth first: 1 (2 4) 3, of which 2 and 4 are the children of 1, and 3 that of the root.
+# Depth first: 1 (2 4) 3. 2 and 4 are the children of 1, and 3 is a child of the root.
 BY_HAND = [
     "3 2 0 0",
     node_line(0, 0, 1),

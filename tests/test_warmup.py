@@ -14,7 +14,7 @@ import pytest
 
 from vslam.run import warmup
 
-# In a process of its own, because other tests have called kernels in this one.
+# In a separate process, because other tests have called kernels in this one.
 SHARES = """
 import gc
 from numba.core.dispatcher import Dispatcher
@@ -88,10 +88,7 @@ def test_kernels_are_cold_without_a_cache_newer_than_the_source(
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the calls that ``compile_kernels`` makes on a machine with an empty cache.
-
-    The machine has two cores.
-    """
+    """Return the calls of ``compile_kernels`` on a machine with two cores and an empty cache."""
     made: list[str] = []
     monkeypatch.setattr(warmup, "is_cold", lambda: True)
     monkeypatch.setattr(warmup, "available_cores", lambda: 2)
@@ -100,10 +97,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def python_is(monkeypatch: pytest.MonkeyPatch, folder: Path, script: str) -> Path:
-    """Replace Python by a shell script.
+    """Replace Python with a shell script, and return the folder of its output.
 
-    The script writes its process id into the returned folder, in a file that is named as its last
-    argument.
+    Each call writes its process id into a file that is named as its last argument.
     """
     python, traces = folder / "python", folder / "started"
     traces.mkdir()

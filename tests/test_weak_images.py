@@ -26,7 +26,7 @@ from vslam.slam import Slam
 
 ORB = OrbConfig(n_features=800)
 CONFIG = Config(orb=ORB)
-# Nothing is measured to be noisy or faint: as images were extracted before.
+# With these thresholds, no image counts as noisy or faint.
 NEVER = WeakImageConfig(noise_from=1e9, spikes_from=1.0, low_contrast=0.0)
 BEFORE = Config(orb=ORB, weak_images=NEVER)
 CAMERA = Camera(300.0, 300.0, 200.0, 100.0, 0.5, 400, 200)
@@ -70,10 +70,7 @@ def test_usual_images_stay_the_same_objects():
 
 
 def test_a_textureless_image_of_good_light_is_not_touched():
-    """An image with few corners does not always have low contrast.
-
-    The contrast in blocks of the image decides.
-    """
+    """Few corners do not mean low contrast. The contrast in blocks of the image decides."""
     stripes = np.tile(np.where(np.arange(400) // 12 % 2, 180, 60).astype(np.uint8), (200, 1))
     (found,) = extract_in_any_light([stripes], CONFIG)
     assert len(found.xy) < 0.5 * ORB.n_features
@@ -110,7 +107,7 @@ def test_spikes_are_counted_and_taken_out(share):
     clean = camera_image(scene(grain_px=4.0)[0])
     image = spiked(clean, share, seed=3)
     _, spikes = grain(image, ROW_STRIDE, LEAST_SPIKE)
-    # One with a spike of its own colour beside it, or like the scene, does not stand out.
+    # A spike next to one of the same colour, or one that resembles the scene, does not stand out.
     assert 0.4 * share < spikes < share
     (mended,) = without_noise([image], CONFIG.weak_images)
     error = [float(np.abs(one.astype(float) - clean).mean()) for one in (image, mended)]

@@ -17,7 +17,7 @@ from vslam.cli.main import app
 from vslam.errors import InputError
 
 EXTRA = ("torch", "safetensors", "onnx", "onnxscript")
-# None in sys.modules would not do: scipy asks for the attributes of every torch that is there.
+# None in sys.modules is not sufficient, because scipy reads attributes of sys.modules["torch"].
 BLOCK = f"""
 import sys
 from importlib.machinery import PathFinder

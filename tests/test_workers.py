@@ -11,11 +11,11 @@ import pytest
 
 from vslam.workers import Job, Urgency, Workers
 
-PATIENCE = 20.0  # seconds, for what takes milliseconds on an idle machine
+PATIENCE = 20.0  # seconds; an idle machine needs milliseconds
 
 
 def occupy(workers: Workers) -> tuple[Job[bool], threading.Event]:
-    """Let the only worker wait in a job. Returns the job, and the event that ends it."""
+    """Let the only worker wait in a job. Return the job, and the event that ends it."""
     begun, end = threading.Event(), threading.Event()
 
     def work() -> bool:
@@ -137,7 +137,7 @@ def test_ctrl_c_while_another_job_runs_reaches_who_waits():
     workers.submit(interrupted, Urgency.READING)
     with pytest.raises(KeyboardInterrupt):
         busy.result()
-    assert busy.result()  # it can be waited for again
+    assert busy.result()  # the result can be requested again
 
 
 def test_a_cancelled_job_never_runs_and_one_that_has_begun_is_completed():

@@ -1,7 +1,7 @@
 """Writes a small valid file of each kind that vslam reads. ``tools/fuzz.py`` damages these files.
 
-Each function writes into a folder. Imports are inside the functions, so that the process that only
-supervises the readers does not load the packages.
+Imports are inside the functions, so that the process that only supervises the readers does not load
+the packages.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def images(folder: Path) -> None:
 
 
 def other_images(folder: Path) -> None:
-    """Write an image in each file format. The file names are time stamps."""
+    """Write an image in each file format. The file names are timestamps."""
     import cv2
     from source_files import write_calibration
 
@@ -230,7 +230,7 @@ def map_file(folder: Path) -> None:
 
 
 def _drive(places: range, seed: int) -> Slam:
-    """Make a ``Slam`` in a ring of landmarks, after a drive through these places."""
+    """Make a ``Slam`` that has mapped these places of a ring of points."""
     from ring import CAMERA
 
     from vslam.slam import Slam
@@ -244,7 +244,7 @@ def _drive(places: range, seed: int) -> Slam:
 def drive_on(slam: Slam, places: range, seed: int, start: float) -> None:
     from vslam.features import Extracted, Features
 
-    camera = slam.context.camera  # the camera of a map may differ
+    camera = slam.context.camera  # the camera of the map may differ
     for i, place in enumerate(places):
         seen = _ring().see(place, seed)
         inside = (seen.xy < (camera.width, camera.height)).all(1)

@@ -12,11 +12,10 @@ alternately, and never at the same time. The first round is not counted. In each
 - with ``--no-report`` and each detector of ``--also`` instead of ``bow``,
 - in the last round, with ``--realtime``. This run takes as long as the drive.
 
-The beginning of the page and the section "Limits" are written by hand. The script keeps them.
+The script keeps the beginning of the page and the section "Limits", which are written by hand.
 
-The script measures the wall time, CPU time and peak memory of whole processes, as reported by the
-operating system. vslam.evaluation.trajectories computes the errors of both systems from their
-trajectory files. vslam/lab/stress/orbslam3.py runs ORB-SLAM3, as in ``vslam stress``.
+The wall time, CPU time and peak memory are those of whole processes. The errors of both systems are
+computed from their trajectory files.
 """
 
 from __future__ import annotations
@@ -52,9 +51,9 @@ does neither. For a fair comparison, vslam also runs with `--no-report` and with
 - **Whole process** is the time from the start of Python to its end. It includes reading the \
 vocabulary, loading the kernels from Numba's cache and writing all files.
 - **Frame loop** is the time from the first image to the last pose.
-- **The same without reading images.** The CPU time for decoding both images of a frame is \
-measured in separate processes: with vslam's own reader for vslam, and with `cv2.imread` for \
-ORB-SLAM3. The rows with this name subtract it.
+- **The same without reading images.** In the rows with this name, the CPU time for decoding both \
+images of a frame is subtracted. This time was measured in separate processes: with vslam's own \
+reader for vslam, and with `cv2.imread` for ORB-SLAM3.
 - **Real-time run and profile.** Each of them is done once per case. `tools/profile_frame.py` \
 takes the profile, with one thread.
 """
@@ -104,8 +103,6 @@ class Case(NamedTuple):
 
 
 class OrbSlam3(NamedTuple):
-    """The Python interpreter for which pyorbslam3 is installed, and the vocabulary."""
-
     python: Path
     vocabulary: Path
 
@@ -126,9 +123,9 @@ class Process(NamedTuple):
 class Run(NamedTuple):
     """One run of vslam or ORB-SLAM3.
 
-    ``report`` is the report that the system wrote. It contains at least the ``frames``, ``fps`` and
-    ``cpu_ms_per_frame`` of the frame loop. ``trajectory`` is a file in KITTI's or TUM's format,
-    which is deleted together with the folder of the run.
+    ``report`` contains at least the ``frames``, ``fps`` and ``cpu_ms_per_frame`` of the frame loop.
+    ``trajectory`` is a file in KITTI's or TUM's format, which is deleted together with the folder
+    of the run.
     """
 
     process: Process
@@ -173,7 +170,6 @@ def measure(command: list[str], folder: Path) -> Process:
 def sample_memory(
     pid: int, ended: threading.Event, start: float, held: list[tuple[float, float]]
 ) -> None:
-    """Record the memory of a process twice a second."""
     while not ended.wait(0.5):
         with suppress(OSError):
             status = Path(f"/proc/{pid}/status").read_text()
@@ -198,7 +194,6 @@ def parse_case(text: str) -> Case:
 
 
 def sides(case: Case) -> list[Path]:
-    """Return the folders of the left and right images of a case."""
     return [case.data / "sequences" / case.seq / f"image_{side}" for side in (0, 1)]
 
 
@@ -216,8 +211,8 @@ def reading_ms(case: Case, system: str) -> float:
 def run_vslam(case: Case, folder: Path, *words: str) -> Run:
     """Run vslam on a case. ``words`` are added to its command line.
 
-    With --no-report, vslam gets no ground truth and does not evaluate its trajectory. Therefore,
-    the times can be compared with those of ORB-SLAM3, which does not evaluate its trajectory.
+    With ``--no-report``, vslam gets no ground truth. Like ORB-SLAM3, it then does not evaluate its
+    trajectory, so that their times can be compared.
     """
     data = case.data
     if "--no-report" in words:
@@ -246,12 +241,10 @@ def run_orbslam3(case: Case, system: OrbSlam3, folder: Path) -> Run:
 def measure_case(
     case: Case, orbslam3: OrbSlam3 | None, repeats: int, also: list[str], scratch: str
 ) -> dict[str, list[Run]]:
-    """Run all systems on a case several times.
-
-    Each run has its own folder in ``scratch``.
+    """Run all systems on a case several times, each time in a new folder in ``scratch``.
 
     Returns:
-        For each name of a system, its runs. The runs of the first round are left out.
+        The runs of each system, without the first round.
     """
     runs: dict[str, list[Run]] = {FULL: [], ORBSLAM3: [], LEAN: [], LIVE: []}
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
@@ -279,7 +272,6 @@ def measure_case(
 
 
 def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
-    """Return the value of each measure for one run; NaN if it is unknown."""
     import numpy as np
 
     from vslam.datasets import open_sequence
@@ -334,10 +326,7 @@ def comparison(measured: dict[str, list[dict[str, float]]]) -> str:
 
 
 def spread(values: list[float], form: str) -> str:
-    """Format values as ``median (smallest - largest)``.
-
-    The text contains only the median if the smallest and the largest value are equal when printed.
-    """
+    """Format values as ``median (smallest - largest)``, or as the median if they are all equal."""
     low, high = format(min(values), form), format(max(values), form)
     median = format(statistics.median(values), form)
     return median if low == high else f"{median} ({low} - {high})"
@@ -346,7 +335,7 @@ def spread(values: list[float], form: str) -> str:
 def latency(runs: dict[str, list[Run]], case: Case) -> str:
     """Return a table of the latency from an image to its pose.
 
-    For ORB-SLAM3, the table contains its tracking times.
+    For ORB-SLAM3, the table contains the times of its tracking calls.
     """
     ours = [run.report for run in runs[LIVE]]
     values = [
@@ -369,7 +358,6 @@ def latency(runs: dict[str, list[Run]], case: Case) -> str:
 
 
 def rate(case: Case) -> float:
-    """Return the frame rate at which the sequence of a case was recorded."""
     times = (case.data / "sequences" / case.seq / "times.txt").read_text().split()[: case.frames]
     return (len(times) - 1) / (float(times[-1]) - float(times[0]))
 
@@ -377,8 +365,8 @@ def rate(case: Case) -> float:
 def stages(report: dict[str, Any]) -> str:
     """Return a table of the wall time of each stage of vslam.
 
-    Stages in the thread pool overlap with other stages. Therefore, the sum of these times is not
-    the time of a frame.
+    The sum of these times is not the time of a frame, because stages in the thread pool overlap
+    with others.
     """
     lines = ["| stage, ms | mean | p50 | p95 | p99 |", "|---|---|---|---|---|"]
     for name, ms in report["stage_ms"].items():
@@ -408,7 +396,6 @@ def memory(run: Run) -> str:
 def measures(
     case: Case, runs: dict[str, list[Run]], reading: dict[str, float]
 ) -> dict[str, list[dict[str, float]]]:
-    """Return the values of all measures for each system. Runs in real time are left out."""
     return {
         s: [figures(run, case, reading[ORBSLAM3 if s == ORBSLAM3 else FULL]) for run in runs[s]]
         for s in runs
@@ -422,7 +409,6 @@ def section(
     reading: dict[str, float],
     measured: dict[str, list[dict[str, float]]],
 ) -> str:
-    """Return the section of the page that describes the results of a case."""
     return (
         f"## {case.title}\n\nThe drive has {case.frames} frames. Decoding both images of a frame "
         f"takes {reading[FULL]:.1f} ms of CPU time with vslam's reader, and "
@@ -433,10 +419,7 @@ def section(
 
 
 def profile(case: Case) -> str:
-    """Return a table of the CPU time per frame by stage.
-
-    If profiling fails, the text is empty, so that the other results are not lost.
-    """
+    """Return a table of the CPU time per frame by stage; an empty text if profiling fails."""
     tool = str(Path(__file__).with_name("profile_frame.py"))
     command = [sys.executable, tool, str(case.data), case.seq, str(case.frames)]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -446,7 +429,6 @@ def profile(case: Case) -> str:
 
 
 def orbslam3_of(options: argparse.Namespace) -> OrbSlam3 | None:
-    """Return the installation of ORB-SLAM3 that the options name; None if they name none."""
     given = (options.orbslam3_python, options.vocabulary)
     if not any(given):
         return None
@@ -476,10 +458,6 @@ def parse_options() -> argparse.Namespace:
 
 
 def setting_of(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) -> str:
-    """Return a paragraph with the machine, the versions and the number of runs.
-
-    The machine and the versions are taken from the report of a run of vslam.
-    """
     ask = f"from importlib.metadata import version; print(version('{PACKAGE}'))"
     version = ""
     if system is not None:
@@ -488,10 +466,10 @@ def setting_of(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) ->
     machine = report["machine"]
     ours = ", ".join(f"{name} {number}" for name, number in report["versions"].items())
     return (
-        f"The comparisons give the median (least - greatest) of {repeats} runs of each system. The "
-        f"systems ran alternately, on {time.strftime('%Y-%m-%d')}. The machine was: "
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. The versions were: "
-        f"{ours}{version}."
+        f"The comparisons give the median (minimum - maximum) of {repeats} runs of each system. "
+        f"The systems ran alternately, on {time.strftime('%Y-%m-%d')}. Machine: "
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['platform']}. Versions: "
+        f"{ours}{version}. *method* is the version of the SLAM method (`vslam.METHOD_VERSION`)."
     )
 
 
@@ -504,10 +482,7 @@ def anonymous(command: str) -> str:
 
 
 def written(page: Path) -> tuple[str, str]:
-    """Return the hand-written parts of a page.
-
-    These are the text before ``BEGIN``, and the text that starts at ``END``.
-    """
+    """Return the hand-written parts of a page: before ``BEGIN``, and after ``END``."""
     text = page.read_text(encoding="utf-8") if page.exists() else ""
     above, begin, rest = text.partition(BEGIN)
     _, end, below = rest.partition(END)
@@ -515,10 +490,7 @@ def written(page: Path) -> tuple[str, str]:
 
 
 def write_table(path: Path, cases: dict[str, dict[str, list[dict[str, float]]]]) -> None:
-    """Write a table with a row for each case and system.
-
-    Each row has the median, the smallest and the largest value of each measure.
-    """
+    """Write the median, the smallest and the largest value of each measure, by case and system."""
     endings = {"": statistics.median, "_least": min, "_greatest": max}
     names = [f"{key}{ending}" for key, *_ in MEASURES for ending in endings]
     with path.open("w", newline="", encoding="utf-8") as file:

@@ -1,19 +1,18 @@
-"""Make the tables and figures of README and the documentation from runs, and check them.
+"""Make the tables and figures of the documentation from runs, and check that they are up to date.
 
     python tools/figures.py [--quick] [--only TEXT]    # make figures, make figures FIGURES=quick
     python tools/figures.py --check                    # make figures-check
     python tools/figures.py --adopt [VERSION]          # stamp files that were made by other means
 
-``figures.toml`` lists every table and figure with the command that makes it. The command is run by
-bash in the root of the repository. The command writes the files into the folder ``$OUT``. The
-folder ``$TOWNS`` contains rendered towns. Each version of the method has its own folder ``$OUT`` in
-``runs/figures``. The folder ``$OUT`` is kept, so that an interrupted command can be resumed.
+``figures.toml`` lists every table and figure with the bash command that makes it. The command
+writes the files into the folder ``$OUT``. The folder ``$TOWNS`` contains rendered towns. Each
+version of the method has its own folder ``$OUT`` in ``runs/figures``. This folder is kept, so that
+an interrupted command can be resumed.
 
-The files are then copied to their places in the repository. With ``--quick``, they are copied to
-``build/figures`` instead. For each file, a stamp is written to ``docs/stamps.json`` in the
-repository or in ``build/figures``. A stamp contains the commit, the version of the method, the
-machine, the seed, the command and the digest of the file. A file is not made again if it has a
-valid stamp of the current version of the method.
+The files are then copied to their places in the repository, or with ``--quick`` to
+``build/figures``. For each file, a stamp is written to ``docs/stamps.json`` there. A stamp contains
+the commit, the version of the method, the machine, the seed, the command and the digest of the
+file. A file with a valid stamp of the current version of the method is not made again.
 
 sources.py explains how a page names the file from which its numbers are taken.
 """
@@ -57,10 +56,8 @@ class Entry:
         reads: files of other entries that the commands read.
         seed: seed of the random numbers.
         trajectories: whether the files depend on the version of the SLAM method.
-        tested: name of the test that compares the files with the code. Files with such a test need
-            no stamp.
-        history: text that says how the files of a finished experiment were made, if there is no
-            command for them.
+        tested: name of the test that compares the files with the code. Such files need no stamp.
+        history: how the files of a finished experiment were made, if there is no command for them.
     """
 
     files: tuple[str, ...]
@@ -81,7 +78,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Stamp:
-    """A stamp, which records how a file was made. A field is None if it is unknown."""
+    """A record of how a file was made. A field is None if it is unknown."""
 
     digest: str
     commit: str
@@ -125,35 +122,26 @@ def read_stamps(folder: Path) -> dict[str, Stamp]:
 
 
 def write_stamps(folder: Path, stamps: dict[str, Stamp]) -> None:
-    """Write the stamps to stamps.json, sorted by file."""
     (folder / STAMPS).parent.mkdir(parents=True, exist_ok=True)
     content = {file: asdict(stamps[file]) for file in sorted(stamps)}
     (folder / STAMPS).write_text(json.dumps(content, indent=1) + "\n")
 
 
 def digest_of(path: Path) -> str:
-    """Return the first 16 hexadecimal digits of the SHA-256 digest of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def is_older(stamp: Stamp, entry: Entry) -> bool:
-    """Return whether a file was made by a different version of the method than the current one.
-
-    Returns False if the file does not depend on the version.
-    """
+    """Return whether a file depends on the method and was made by a different version of it."""
     return entry.trajectories and stamp.method != METHOD_VERSION
 
 
 def make(root: Path, *, quick: bool, only: str = "") -> int:
-    """Make the files that are missing or outdated, and print a sentence for each entry.
+    """Make the files that are missing or outdated, and return the number of failed entries.
 
     Args:
-        root: root of the repository.
         quick: run the short commands and write to build/figures.
         only: make only entries with a file whose path contains this text.
-
-    Returns:
-        Number of entries that failed.
     """
     target = root / "build" / "figures" if quick else root
     failed = 0
@@ -223,7 +211,6 @@ def _run(entry: Entry, command: str, root: Path, target: Path) -> bool:
 
 
 def _stamp(path: Path, entry: Entry, command: str, root: Path, method: int) -> Stamp:
-    """Make the stamp of a file that has just been made."""
     from vslam.report.summary import this_machine
 
     machine = this_machine()
@@ -254,10 +241,8 @@ def adopt(root: Path, method: int | None = None) -> list[str]:
     """Stamp every file that has no valid stamp, and return these files.
 
     Args:
-        root: root of the repository.
-        method: version of the method with which the commands of figures.toml made the files on this
-            machine. If it is None, the version is unknown, and a stamp contains only the commit
-            that wrote the file.
+        method: version of the method that made the files on this machine. If it is None, a stamp
+            contains only the commit that wrote the file.
     """
     stamps, adopted = read_stamps(root), []
     entries = {file: entry for entry in read_entries(root) for file in entry.paths(root)}
@@ -335,9 +320,7 @@ def origin(stamp: Stamp) -> str:
 def mark_older(page: Path, text: str, root: Path) -> str:
     """Mark the files on a page that were made by a different version of the method.
 
-    Returns:
-        The text of the page with marks. There is a line before each table from such a file, and a
-        list of all such files at the end.
+    There is a line before each table from such a file, and a list of these files at the end.
     """
     stamps = read_stamps(root)
     older = {

@@ -55,7 +55,7 @@ class Reader:
         read: function that reads the files in a folder.
         changed: pattern of the names of the files to damage. One file is damaged at a time.
         mutation: function of the content, a random generator and the file name, which returns the
-            changed content. If it is None, `mutate` is used.
+            changed content; None for `mutate`.
     """
 
     write: Callable[[Path], object]
@@ -139,8 +139,8 @@ def _read_map(folder: Path) -> None:
 def _use_map(folder: Path) -> None:
     """Use a saved map in every way that vslam offers.
 
-    The map is exported. Its drive is resumed, and the map is continued with a new drive. Images are
-    localised in the map. Finally, the map is merged with another map.
+    The map is exported, resumed, continued with a new drive, used for localisation, and merged with
+    another map.
     """
     with tempfile.TemporaryDirectory(dir=folder) as out:
         _use_map_in(folder / "map.npz", folder / "other.npz", Path(out))
@@ -247,10 +247,7 @@ _HEADER_VALUES = [
 
 
 def _mutate_meaning(data: bytes, rng: np.random.Generator, name: str) -> bytes:
-    """Change one or two values in arrays or in the header of a map.
-
-    The types and shapes of the arrays are not changed.
-    """
+    """Change one or two values in arrays or in the header of a map, but no types or shapes."""
     with np.load(io.BytesIO(data)) as file:
         arrays = {name: file[name].copy() for name in file.files}
     for _ in range(int(rng.integers(1, 3))):
@@ -273,7 +270,7 @@ def _change(flat: np.ndarray, rng: np.random.Generator, length: int) -> None:
     if not len(at):
         at = rng.integers(len(flat), size=1)
     way = int(rng.integers(5))
-    if way == 0:  # another number of the array
+    if way == 0:  # other numbers of the array
         flat[at] = flat[rng.integers(len(flat), size=len(at))]
     elif way == 1:  # another order
         flat[at] = flat[at][::-1] if len(at) > 1 else flat[len(flat) - 1 - at]
@@ -292,7 +289,7 @@ def _change(flat: np.ndarray, rng: np.random.Generator, length: int) -> None:
 
 
 def _other_number(value: object, rng: np.random.Generator) -> object:
-    """Replace one value in JSON data by a different value."""
+    """Replace one value in JSON data with a different value."""
     if isinstance(value, dict | list) and value and rng.random() < 0.95:
         keys = list(value) if isinstance(value, dict) else list(range(len(value)))
         key = keys[int(rng.integers(len(keys)))]
@@ -354,14 +351,12 @@ def mutate(data: bytes, rng: np.random.Generator, name: str) -> bytes:
 def _place(data: bytes, rng: np.random.Generator) -> int:
     """Return a random position in the content of a file.
 
-    With a probability of one half, the position is in the first 256 bytes, because these contain
-    the header.
+    With a probability of one half, it is in the first 256 bytes, which contain the header.
     """
     return int(rng.integers(min(len(data), 256) if rng.random() < 0.5 else len(data)))
 
 
 def _bytes(data: bytes, rng: np.random.Generator) -> bytes:
-    """Flip a bit, or replace, truncate, remove, repeat or insert bytes."""
     way, at, size = rng.integers(8), _place(data, rng), int(rng.integers(1, 64))
     if way < 2:
         return data[:at] + bytes([data[at] ^ 1 << int(rng.integers(8))]) + data[at + 1 :]
@@ -380,7 +375,6 @@ def _bytes(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _number(data: bytes, rng: np.random.Generator) -> bytes:
-    """Replace a number in a text by a different number."""
     found = list(re.finditer(rb"-?\d+(\.\d+)?(e[-+]?\d+)?", data))
     if not found:
         return data
@@ -389,7 +383,6 @@ def _number(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _lines(data: bytes, rng: np.random.Generator) -> bytes:
-    """Move, duplicate or remove a line."""
     lines = data.split(b"\n")
     at, to = (int(rng.integers(len(lines))) for _ in range(2))
     line = lines[at] if rng.random() < 0.3 else lines.pop(at)
@@ -401,7 +394,7 @@ def _lines(data: bytes, rng: np.random.Generator) -> bytes:
 def _nest(data: bytes, rng: np.random.Generator) -> bytes:
     """Insert deeply nested brackets, or YAML aliases that grow exponentially."""
     way = int(rng.integers(6))
-    if way == 5:  # replace a list by one that grows exponentially
+    if way == 5:  # replace a list with one that grows exponentially
         return _GROWING + b"\n" + re.sub(rb"\[[^]]*\]", b"*a8", data, count=1)
     bombs = (
         b"[" * 20_000,
@@ -474,8 +467,8 @@ def _reset_peak() -> None:
 def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
     """Read damaged inputs in this process.
 
-    For each input, a JSON line with its number is printed before it is read. A second line with the
-    outcome is printed afterwards.
+    For each input, a JSON line with its number is printed before it is read, and a JSON line with
+    the outcome afterwards.
     """
     from vslam.errors import InputError
 

@@ -1,12 +1,11 @@
 """Kill runs at random times and resume them, to test that little work is lost.
 
-``kill -9`` ends a run after a random number of frames. In every other run, the script first waits
-for the next autosave and kills the run while the autosave is being written. Afterwards, all files
-of the run are read, and the run is resumed.
+``kill -9`` ends a run after a random number of frames. Every other run is killed while an autosave
+is being written. Afterwards, all files of the run are read, and the run is resumed.
 
-The script prints a table. For each run, the table contains the frame at which the run was killed,
-the number of saved frames, the seconds of work that were lost, and the ATE of the whole run. It
-also tells whether the trajectory is byte-identical to the trajectory of an undisturbed run.
+The script prints for each run the frame at which it was killed, the number of saved frames, the
+seconds of work that were lost, and the ATE of the whole run. It also tells whether the trajectory
+is byte-identical to the trajectory of an undisturbed run.
 
     python tools/kill_test.py --kills 10 --autosave 4 -- --dataset synthetic --seq demo
 """
@@ -35,17 +34,14 @@ BRIEF = ("--no-record", "--no-report", "--quiet")
 
 
 def report_of(folder: Path) -> dict[str, float]:
-    """Read the report of a finished run."""
     return json.loads((folder / "report.json").read_text())
 
 
 def trajectory_of(folder: Path) -> bytes:
-    """Read the trajectory file of a finished run."""
     return (folder / "trajectory.tum").read_bytes()
 
 
 def frames_done(folder: Path) -> int:
-    """Return the number of frames that a run has tracked so far."""
     try:
         return (folder / ONLINE).read_bytes().count(b"\n")
     except OSError:
@@ -53,7 +49,6 @@ def frames_done(folder: Path) -> int:
 
 
 def is_saving(folder: Path) -> bool:
-    """Return whether a run is writing an autosave at this moment."""
     return any(folder.glob(".autosave*.part"))
 
 
@@ -80,8 +75,7 @@ def saved_frames(folder: Path) -> tuple[int, float]:
     """Read all files of a killed run.
 
     Returns:
-        The number of saved frames, and the wall time of the run until these frames were saved, in
-        seconds.
+        The number of saved frames, and the wall time of the run when they were saved, in seconds.
     """
     read_trajectory(folder / ONLINE)
     if not (folder / MAP).exists():

@@ -12,10 +12,6 @@ TABLE = Path(__file__).parents[1] / "docs" / "howto" / "laws.csv"
 
 
 def table() -> str:
-    """Return a CSV table with a row for each kind of perturbation.
-
-    The columns include the weakest and the strongest value that ``vslam stress`` tries.
-    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(

@@ -29,7 +29,7 @@ TIME = LinearSegmentedColormap.from_list("time", ["#fbbf24", "#fb923c", "#6366f1
 
 
 def draw(run: Path) -> NDArray[np.uint8]:
-    """Draw the two images of a loop, with the map below them, as ``(H, W, 3)`` uint8 BGR."""
+    """Draw the two images of a loop above the map of the run, as ``(H, W, 3)`` uint8 BGR."""
     stored = load_map(run / "map.npz")
     ends = [stored.loops[0].match, stored.loops[0].query]
     match, query = stored.map.frames[ends]
@@ -38,7 +38,7 @@ def draw(run: Path) -> NDArray[np.uint8]:
 
 
 def _draw_map(stored: StoredMap, ends: list[int], names: tuple[str, str]) -> NDArray[np.uint8]:
-    """Draw the landmarks and the camera path of a map from above, coloured by time.
+    """Draw the landmarks and the camera path from above, coloured by time.
 
     The z axis of the map points to the right.
     """

@@ -35,10 +35,7 @@ def main() -> None:
 
 
 def tables(report: LoopsJson) -> dict[str, list[Row]]:
-    """Return the rows of all tables by the name of the table.
-
-    A table has no rows if the report has no results for it.
-    """
+    """Return the rows of each table. A table without results in the report has no rows."""
     cells = report.cells
     ordered = [cell for cell in cells if cell.sequence_right is not None]
     return {

@@ -2,10 +2,9 @@
 
     python tools/profile_frame.py DATA SEQ FRAMES [--detector bow] [--report]
 
-DATA is a folder in KITTI's format. The times in the table are in milliseconds. The run has only one
-thread, so that the CPU clock of this thread measures every stage. If a stage calls another stage,
-the time counts only for the inner stage. The total is the CPU time of the process, from the start
-of Python until the last file is written.
+DATA is a folder in KITTI's format. The run has only one thread, so that the CPU clock of this
+thread measures every stage. The total is the CPU time of the process, from the start of Python
+until the last file is written.
 
 Run the script twice. In the second run, the kernels are loaded from Numba's cache. The time for
 loading a kernel counts for the first stage that calls the kernel.
@@ -24,7 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-# The functions of each stage: their module, and their name or Class.name in it.
+# The functions of each stage, as pairs: module, and NAME or CLASS.NAME.
 STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("start: vocabulary", (("vslam.run.pipeline", "detector_with_images"),)),
     ("read images", (("vslam.datasets.image_files", "read_grey"),)),
@@ -92,7 +91,6 @@ class StageClock:
         return call
 
     def measure(self, stage: str, module_name: str, name: str) -> None:
-        """Replace a function in its module or class with a function that is timed."""
         owner: Any = importlib.import_module(module_name)
         *classes, last = name.split(".")
         for each in classes:
@@ -101,7 +99,6 @@ class StageClock:
 
 
 def table(seconds: dict[str, float], frames: int) -> str:
-    """Return a Markdown table with the milliseconds per frame and the share of each stage."""
     whole = time.process_time()
     rows = [(stage, seconds[stage]) for stage, _ in STAGES]
     rows += [("imports and the rest of the start", whole - sum(s for _, s in rows))]

@@ -26,14 +26,10 @@ def main() -> None:
 
 
 def row_of(run: RunEntry) -> dict[str, object]:
-    """Return the row of a run: its drive, its system, two seeds, and its measures.
-
-    The two seeds are the seed of the perturbation and the seed of the rendered town.
-    """
     measures = {
         name: "" if run.measures[name] is None else f"{run.measures[name]:.{decimals}f}"
         for name, decimals in DECIMALS.items()
-        if name != "fps"  # it depends on the load; docs/research/performance.csv has the speed
+        if name != "fps"  # the speed depends on the load of the machine
     }
     named = {"system": run.system, "seed": run.seed, "town": run.town, "alignment": run.alignment}
     return run.drive.model_dump() | named | {"frames": run.frames} | measures

@@ -38,7 +38,6 @@ OVER_ROWS = {"mean": mean, "median": median, "sum": sum}
 
 
 def lines_of(comment: str) -> list[str]:
-    """Return the lines of a comment that names the source of a table."""
     return [line.strip() for line in comment.strip().splitlines()]
 
 
@@ -120,8 +119,7 @@ def _is_rounded(shown: str, value: float) -> bool:
 def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float | str]:
     """Return the numbers and texts of the CSV file that a cell of a table must show.
 
-    Args:
-        row: the head of the column of the cell, followed by all cells of the row.
+    ``row`` contains the head of the cell's column, followed by all cells of the row.
     """
     with path.open(newline="", encoding="utf-8") as file:
         table = list(csv.DictReader(file))

@@ -54,7 +54,7 @@ The other numbers of the method are constants in the code. They are mathematical
 
 
 class Row(NamedTuple):
-    """One threshold: its dotted name, its default, its meaning and unit, and its source."""
+    """One threshold. ``text`` contains its meaning and its unit."""
 
     name: str
     default: str
@@ -63,7 +63,7 @@ class Row(NamedTuple):
 
 
 def descriptions(model: type[BaseModel]) -> dict[str, str]:
-    """Return the docstring below each field of a class as one line. It is empty if missing."""
+    """Return the docstring below each field of a class as one line; empty if it is missing."""
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
     assert isinstance(definition, ast.ClassDef)
     found = {}
@@ -94,7 +94,6 @@ def rows(config: Config, section: str) -> list[Row]:
 
 
 def page(config: Config) -> str:
-    """Return the page for a configuration. Each section has its docstring and a table."""
     lines = [HEAD]
     for section in type(config).model_fields:
         title, _, rest = (type(getattr(config, section)).__doc__ or "").partition("\n\n")

@@ -1,12 +1,11 @@
 """Build the wheel, install it into a clean environment and run it from another folder.
 
-The script finds errors that the tests cannot find. Examples are files that are missing in the
-wheel, dependencies that only the development environment has, and imports that work only in the
-checkout. The script runs vslam on the first frames of a rendered drive, whose ground truth is
-exact.
+This finds errors that the tests cannot find: files that are missing in the wheel, dependencies that
+only the development environment has, and imports that work only in the checkout. vslam is run on
+the first frames of a rendered drive, whose ground truth is exact.
 
-For each Python that ``--python`` names, a separate environment is made. With ``--runners``, the
-wheel is also started using pipx and uvx, if they are installed.
+Each Python of ``--python`` gets its own environment. With ``--runners``, the wheel is also started
+using pipx and uvx, if they are installed.
 
 usage: python tools/wheel_test.py [--python python3.12 ...] [--runners]
 """
@@ -58,7 +57,6 @@ def check_run(folder: Path) -> None:
 
 
 def try_environment(python: str, wheel: Path, scratch: Path) -> None:
-    """Install the wheel for a Python version, and run vslam outside of the checkout."""
     run(python, "-m", "venv", scratch / "env", cwd=scratch)
     binaries = scratch / "env" / "bin"
     pip = binaries / "pip"

@@ -1,4 +1,4 @@
-"""The camera of a rectified stereo pair, from its ``sensor_msgs/CameraInfo``; needs no ROS."""
+"""Makes the camera of a rectified stereo pair from ``sensor_msgs/CameraInfo``, without ROS."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from vslam import Camera
 
 
 def camera_of(left: Any, right: Any) -> Camera:
-    """The camera of a pair of ``image_rect`` topics, from the matrices P of their ``camera_info``.
+    """Return the camera of a rectified stereo pair, from the matrices P of its ``camera_info``.
 
     Args:
         left, right: ``sensor_msgs/CameraInfo``.
 
     Raises:
-        ValueError: the images are not those of a calibrated and rectified pair.
+        ValueError: the cameras are not calibrated, or the pair is not rectified.
     """
     P_left, P_right = (np.reshape(info.p, (3, 4)).astype(float) for info in (left, right))
     if not P_left[0, 0]:

@@ -1,4 +1,4 @@
-"""A node of ROS 2: rectified stereo images in, odometry and transforms out (README.md)."""
+"""A ROS 2 node that receives rectified stereo images and publishes poses (README.md)."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ TOPICS = {
     "left/camera_info": CameraInfo,
     "right/camera_info": CameraInfo,
 }
-MOST_WAITING = 5  # pairs of images; older pairs are dropped while tracking is too slow
-APART_S = 0.005  # largest difference between the stamps of a pair
+MOST_WAITING = 5  # stereo pairs; if tracking is too slow, older pairs are dropped
+APART_S = 0.005  # seconds; largest difference between the timestamps of a pair
 
 
 def message_type(name: str) -> Any:
-    """The class of a message, such as ``nav_msgs/msg/Odometry``."""
+    """Return the class of a message, such as ``nav_msgs/msg/Odometry``."""
     package, _, message = name.split("/")
     return getattr(import_module(f"{package}.msg"), message)
 
 
 class SlamNode(Node):
-    """Tracks every pair of images, and publishes its pose with the stamp of the left image."""
+    """Tracks each stereo pair, and publishes its pose with the timestamp of the left image."""
 
     def __init__(self) -> None:
         super().__init__("vslam")
@@ -57,7 +57,6 @@ class SlamNode(Node):
         self.pairs.registerCallback(self.track)
 
     def track(self, left: Image, right: Image, *infos: CameraInfo) -> None:
-        """Track a pair of images."""
         stamp = stamp_of(left)
         try:
             if self.slam is None:
@@ -69,14 +68,13 @@ class SlamNode(Node):
             self.get_logger().warning(f"a pair of images is left out: {error}")
 
     def publish(self, stamp: int, result: TrackResult) -> None:
-        """Publish the pose of a frame, before the frame may become a keyframe."""
+        """Publish the pose of a frame before the frame may become a keyframe."""
         pose = FramePose.of(result, stamp)
         self.odometry.publish(odometry_message(message_type, pose, self.before))
         self.tf.publish(tf_message(message_type, pose))
         self.before = pose
 
     def close(self) -> None:
-        """Complete the map, and save it if a file was named."""
         if self.slam is None:
             return
         self.slam.finish()

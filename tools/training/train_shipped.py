@@ -94,8 +94,7 @@ class Stage:
         frames: options of the source KITTI 00.
         pairs: names of the folders of rendered pairs.
         threads: number of threads of ``vslam train``; None for the default.
-        network: name of the network.
-        other_settings: name of the settings file. Empty if the name of the stage is used.
+        other_settings: name of the settings file if it differs from ``name``.
         epochs: number of epochs; None for the number in the settings.
     """
 
@@ -115,7 +114,7 @@ class Stage:
         return out / self.name / f"{self.network}.safetensors"
 
     def finished(self, out: Path) -> bool:
-        """Return whether this stage is finished: the model card, which is written last, exists."""
+        """Return whether the model card exists, which is written last."""
         card = self.weights(out).with_suffix(".json")
         return card.exists() and bool(json.loads(card.read_text())["finished"])
 
@@ -150,7 +149,6 @@ PAPER = (
 
 
 def main() -> None:
-    """Parse the command line, and run the parts of the training that are not finished."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--kitti", type=Path, required=True, help="folder with sequences/")
     parser.add_argument(

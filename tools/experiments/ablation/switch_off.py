@@ -1,10 +1,10 @@
 """Switch off the parts of the method one at a time, and compare the errors on the same drives.
 
 python tools/experiments/ablation/switch_off.py --source "--dataset synthetic --seqs demo" \\
-    --perturb none,noise --out FOLDER
+    --perturb none,noise:1 --out FOLDER
 
 Each ``--source`` contains the options of ``vslam bench`` that select drives. The runs are kept in
-the output folder. Therefore, the same command resumes an interrupted experiment. The table
+the output folder, so that the same command resumes an interrupted experiment. The table
 ``ablation.csv`` in this folder has a row for each part, data set and perturbation.
 """
 
@@ -24,8 +24,8 @@ from vslam.lab.overview.schema import OverviewJson
 class Variant(NamedTuple):
     """One part of the method, and how vslam is run without this part.
 
-    ``thresholds`` are the values of ``--config`` that switch the part off. ``detector`` is the name
-    of the loop detector. ``reference`` is the variant with which the runs are compared.
+    ``thresholds`` are the values of ``--config`` that switch the part off. ``reference`` is the
+    variant with which the runs are compared.
     """
 
     piece: str
@@ -101,8 +101,8 @@ def row_of(
 ) -> dict[str, object]:
     """Make the row of the table for a part, a data set and a perturbation.
 
-    The row contains the ratio of two errors: the error without the part, divided by the error with
-    the part. It also contains the numbers of loops.
+    The row contains the error without the part, divided by the error with the part. It also
+    contains the numbers of loops.
 
     ``condition`` contains the data set and the ``--perturb`` of the drives in this row.
     """

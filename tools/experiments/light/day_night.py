@@ -2,14 +2,13 @@
 
     python tools/experiments/light/day_night.py DATASET SEQ[=MAP_FRAMES] ... --out TABLE.csv
 
-The map is made from the first MAP_FRAMES frames and saved. Then each later left image is localised
-in the map, without using other images. The script counts how many poses are right. If MAP_FRAMES is
-not given, the map is made from the whole drive. In this case, all images of the drive except its
-keyframes are localised.
+The map is made from the first MAP_FRAMES frames. Each later left image is then localised in the
+map, without using other images. If MAP_FRAMES is not given, the map is made from the whole drive,
+and all images except its keyframes are localised. The script counts how many poses are right.
 
 A pose counts as right if it is within 2 m and 15 degrees of the ground truth. These limits were
 also used in AirSLAM's experiment on map reuse (Xu et al., T-RO 2025, section VII-D). Poses are
-compared relative to the nearest frame of the map. Therefore, the drift of the map has no influence.
+compared relative to the nearest frame of the map, so that the drift of the map has no influence.
 """
 
 from __future__ import annotations
@@ -71,7 +70,6 @@ class WholeMap:
 
 
 def map_of(source: Source, n_frames: int, detector: str, path: Path) -> Day:
-    """Make a map from the first frames of a drive, and save the map."""
     slam = Slam(source.camera, detector=detector)
     for frame in islice(source.frames(), n_frames):
         slam.step(*frame.read(map), frame.timestamp)
@@ -88,8 +86,7 @@ class Localiser:
     def __init__(self, day: Day, detector: str, candidates: int) -> None:
         """Load the map in which images are localised.
 
-        ``candidates`` is the number of keyframes with which an image is compared. It is the same
-        for ORB and for learned descriptors.
+        ``candidates`` is the number of keyframes with which an image is compared.
         """
         config = as_config(
             {
@@ -105,11 +102,7 @@ class Localiser:
         self._relocaliser = Relocaliser(slam.context, places.locate, recognise)
 
     def pose(self, image: Image) -> Matrix | None:
-        """Localise an image.
-
-        Returns the ``(4, 4)`` pose ``T_wc`` in the world frame of the map, or None if localisation
-        fails.
-        """
+        """Return the ``(4, 4)`` pose ``T_wc`` of an image; None if localisation fails."""
         extracted = FrameImages(image, lambda: None, self._context).extracted
         frame = Frame.of(extracted, self._context.camera, image=image)
         lost = Found(TrackingState.LOST)

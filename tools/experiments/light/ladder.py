@@ -16,7 +16,6 @@ from vslam.report.schema import ReportJson
 
 
 def rows_of(folder: Path) -> list[list[object]]:
-    """Return a row of the table for each run, sorted by sequence, system, strength and seed."""
     rows: list[list[object]] = []
     for path in folder.glob("*/report.json"):
         try:

@@ -55,9 +55,8 @@ def measure(folder: Path, of_place: int) -> tuple[NDArray[np.bool_], NDArray[np.
     """Apply both tests to all pairs of a set of photographs.
 
     Returns:
-        Two ``(N, 2)`` bool arrays, the first for the right pairs and the second for the wrong
-        pairs. The first column tells whether a pair passes the test by share, and the second column
-        whether it passes the test by number.
+        Two ``(N, 2)`` bool arrays, for the right and for the wrong pairs: whether a pair passes the
+        test by share, and whether it passes the test by number.
     """
     gallery, places = [], []
     for place in sorted(path for path in folder.iterdir() if path.is_dir()):

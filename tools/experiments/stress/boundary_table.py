@@ -17,10 +17,7 @@ NAMES = {"bow": "vslam", "orbslam3": "ORB-SLAM3"}
 
 
 def table(path: Path, ours: str, theirs: str) -> str:
-    """Return a Markdown table of the boundaries of the two systems.
-
-    There is a row for each perturbation under which at least one of the systems was run.
-    """
+    """Return a Markdown table of the boundaries of the two systems, by perturbation."""
     with path.open(newline="") as file:
         rows = {(row["law"], row["system"]): row for row in csv.DictReader(file)}
     # In a comparison with another system, the detector bow is called vslam.

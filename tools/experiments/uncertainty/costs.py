@@ -3,8 +3,8 @@
     python tools/experiments/uncertainty/costs.py --data "$KITTI_ROOT" --seq 06 --frames 51
 
 The script runs vslam on a stereo drive, alternately without a mask and with a mask that hides
-nothing. Therefore, both kinds of run do the same work apart from the mask. The script prints the
-medians of the CPU times. It fails if the trajectories of any two runs differ.
+nothing, and prints the medians of the CPU times. It fails if the trajectories of any two runs
+differ.
 """
 
 from __future__ import annotations
@@ -69,7 +69,6 @@ def main() -> None:
 
 
 def run(options: argparse.Namespace, mask: Path | None) -> RunOutcome:
-    """Run vslam on a stereo drive, with one thread and without loop detection."""
     given = RunOptions(
         data=options.data, dataset="kitti", seq=options.seq, max_frames=options.frames, mask=mask,
         detector="none",

@@ -31,7 +31,6 @@ EVERY = 7  # frames between the starts of intervals; overlapping intervals have 
 
 
 def results_of(source: Source, law: str, seed: int) -> list[TrackResult]:
-    """Run vslam on a drive, and return the result of tracking for every frame."""
     slam = Slam(source.camera)
     perturbation = parse_perturbation(law, seed).bound_to(source)
     results = []
@@ -43,10 +42,7 @@ def results_of(source: Source, law: str, seed: int) -> list[TrackResult]:
 
 
 def mean_nees(results: list[TrackResult], truth: Trajectory, interval_s: float) -> float:
-    """Compute the mean NEES of the motion over intervals of a given length.
-
-    The NEES is divided by the number of degrees of freedom.
-    """
+    """Compute the mean NEES of motions over intervals, divided by the degrees of freedom."""
     return float(motion_errors(results, truth, interval_s).nees[SKIPPED::EVERY].mean())
 
 

@@ -1,8 +1,7 @@
 """Runs the cells of a benchmark (one run each) on a Dask cluster.
 
-The workers send the results back to this machine. If a worker dies, the scheduler gives its cells
-to a different worker. The workers need vslam with the extra ``cluster``. They also need the data
-under the same path as on this machine.
+The workers send the results back to this machine. They need vslam with the extra ``cluster``, and
+the data under the same path as on this machine.
 """
 
 from __future__ import annotations
@@ -24,13 +23,10 @@ _POLL_S = 2.0  # time between checks of the stop event; each check is a request 
 def run_on_cluster(
     cells: Collection[Cell], options: RunOptions, scheduler: str, out: Path
 ) -> Generator[CellOutcome, None, None]:
-    """Run the cells of a benchmark on the workers of a Dask scheduler.
+    """Run the cells of a benchmark (one run each) on the workers of a Dask scheduler.
 
-    When the outcome of a cell (one run) arrives, it is written to the benchmark's folder and
-    yielded.
-
-    The number of cells that a worker runs at the same time is the number of its threads. If the
-    generator is closed, the running cells are stopped.
+    The results of each run are written to ``out`` before its outcome is yielded. A worker runs one
+    cell per thread at a time. If the generator is closed, the running cells are stopped.
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers.
@@ -69,7 +65,7 @@ def run_on_cluster(
 
 
 def _require_certificates(scheduler: str) -> None:
-    """Reject a TLS address if Dask has no certificates. Otherwise, its client would never close."""
+    """Reject a TLS address if Dask has no certificates. Its client would otherwise never close."""
     from distributed.security import Security
 
     if not scheduler.startswith("tls://"):
@@ -86,7 +82,6 @@ def _require_certificates(scheduler: str) -> None:
 
 
 def _run_on_worker(cell: Cell, options: RunOptions, stop: str) -> CellOutcome:
-    """Run a cell (one run) on this worker. Kill the run when the event named ``stop`` is set."""
     from distributed import Event
 
     event = Event(stop)

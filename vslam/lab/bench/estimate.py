@@ -21,14 +21,13 @@ _CELL_BYTES, _FRAME_BYTES, _SCRATCH_FRAME_BYTES = 100_000, 1_000, 45_000
 
 @dataclass(frozen=True)
 class Estimate:
-    """An estimate of the time and the disk space that the runs of a benchmark need.
+    """The time and the disk space that the missing runs of a benchmark need.
 
     Attributes:
-        seconds: wall time in seconds for all runs together. It is assumed that the requested number
-            of runs is executed at the same time.
+        seconds: estimated wall time of all missing runs together.
         kept: size in bytes of the files that are kept.
         scratch: size in bytes of the files that are deleted after each run.
-        basis: text that says on what the estimated time is based.
+        basis: text that says on what ``seconds`` is based.
     """
 
     seconds: float
@@ -45,14 +44,13 @@ def estimate(
 ) -> Estimate:
     """Estimate how much time and disk space the missing runs of a benchmark need.
 
-    The estimate is based on the finished runs. If a run with the same detector is finished, its
-    time per frame is used.
+    The speed is taken from the finished runs, if possible from those with the same detector.
 
     Args:
-        missing: cells of the benchmark's grid (one run each) that have not been run yet.
+        missing: cells of the benchmark (one run each) that have not been run yet.
         finished: finished cells and the reports of their runs.
         frames: number of frames of each sequence.
-        jobs: number of cells that are run at the same time.
+        jobs: number of cells that run at the same time.
     """
     frame_s: dict[str, list[float]] = {}  # for each detector, seconds per frame of finished cells
     starts: list[float] = []
@@ -95,7 +93,7 @@ def check_disk(needed: Estimate, out: Path) -> None:
 
 
 def duration(seconds: float) -> str:
-    """Format a duration as a text such as ``2 h 05 min``, ``7 min`` or ``40 s``."""
+    """Format a duration, for example as ``2 h 05 min``, ``7 min`` or ``40 s``."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -103,7 +101,7 @@ def duration(seconds: float) -> str:
 
 
 def size(n_bytes: float) -> str:
-    """Format a number of bytes as a text in MB or GB."""
+    """Format a number of bytes in MB or GB."""
     return f"{n_bytes / 1e6:.0f} MB" if n_bytes < 1e9 else f"{n_bytes / 1e9:.1f} GB"
 
 

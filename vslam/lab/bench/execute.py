@@ -1,11 +1,10 @@
 """Runs each cell of a benchmark in its own process, and writes its results into a folder.
 
-A cell is one run of vslam. The folder of a cell appears only when the results of the run are
-complete. A cell is finished if its folder exists. Therefore, if a benchmark is killed, only the
-cells that were running are lost.
+A cell is one run of vslam. The folder of a cell appears only when its results are complete. If a
+benchmark is killed, only the cells that were running are lost.
 
-The result files of a cell have a size of a few MB. They are passed to this module in memory, even
-if the cell was run on another machine. Only this module writes to the folder of the benchmark.
+The result files of a cell (a few MB) are passed in memory, because the cell may have been run on
+another machine. Only this module writes to the folder of the benchmark.
 """
 
 from __future__ import annotations
@@ -36,16 +35,15 @@ class RunOptions:
     """Options that are the same for all runs of a benchmark.
 
     Attributes:
-        data: root folder of the data set on the machine on which vslam is run; None for rendered
+        data: root folder of the data set on the machine that runs the cell; None for rendered
             towns.
         config: thresholds, as the text of a file ``config.json``.
         threads: number of threads of each run. It does not change the results of the runs.
-        command: program that is run instead of ``vslam`` and accepts the same arguments; None for
-            vslam itself.
-        others: programs of other SLAM systems. The key is the name of the system, as in
-            ``Cell.detector``. The programs accept the same arguments as ``vslam``.
-        scratch: folder to which each run first writes its files; None for the machine's temporary
-            folder.
+        command: program that is run instead of ``vslam``, with the same arguments.
+        others: programs of other SLAM systems by ``Cell.detector``. They accept the same arguments
+            as ``vslam``.
+        scratch: folder for the files of unfinished runs; None for the temporary folder of the
+            machine.
         source: arguments of ``vslam run`` that describe how to read the data.
     """
 
@@ -60,7 +58,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Finished:
-    """A complete run, with the contents of its files by path. Paths are relative to ``folder``."""
+    """A complete run, and the contents of its files. File paths are relative to ``folder``."""
 
     cell: Cell
     folder: str
@@ -69,7 +67,7 @@ class Finished:
 
 @dataclass(frozen=True)
 class Failed:
-    """A run that gave no results, with the reason in one line and the whole output of the run."""
+    """A run without results: a one-line reason, and the output of the run."""
 
     cell: Cell
     message: str
@@ -85,8 +83,7 @@ def run_cell(
     """Run one cell of a benchmark (a single run) in a temporary folder, and return its files.
 
     Args:
-        stopped: function that is called repeatedly during the run. If the function returns True,
-            the run is killed.
+        stopped: called repeatedly during the run. If it returns True, the run is killed.
     """
     if options.scratch is not None:
         options.scratch.mkdir(parents=True, exist_ok=True)
@@ -116,18 +113,15 @@ def run_here(
 ) -> Generator[CellOutcome, None, None]:
     """Run the cells of a benchmark on this machine, ``jobs`` cells at a time.
 
-    A cell is one run. When a cell ends, its outcome is written to the benchmark's folder and
-    yielded. If the generator is closed, the running cells are killed.
-
-    The cells are started from threads. Threads are sufficient, because each thread only waits for a
-    process. The threads also write the outcomes. Therefore, if a cell ends while the caller is
-    being interrupted, its outcome is not lost.
+    A cell is one run. Its results are written to ``out`` before its outcome is yielded. If the
+    generator is closed, the running cells are killed.
 
     Raises:
         ResultsError: the results of a cell cannot be written.
     """
     stop = threading.Event()
 
+    # A thread writes its own results, so that they are not lost if the caller is interrupted.
     def run_and_publish(cell: Cell) -> CellOutcome:
         try:
             outcome = run_cell(cell, options, stop.is_set)
@@ -193,8 +187,8 @@ def prepare(out: Path, data: str) -> None:
     """Create the folder of a benchmark, and remove files that a killed benchmark left there.
 
     Args:
-        data: text that identifies the data set. All results in a folder must come from the same
-            data set, because sequences of different data sets may have the same names.
+        data: text that identifies the data set. A folder can only contain results of one data set,
+            because sequences of different data sets may have the same names.
 
     Raises:
         InputError: the folder cannot be written, or it contains runs on different data.
@@ -232,7 +226,7 @@ def tidy(out: Path) -> None:
 
 
 def _call(command: list[str], log: Path, stopped: Callable[[], bool]) -> int:
-    """Run a command and return its exit code. If ``stopped`` returns True, kill the command.
+    """Run a command and return its exit code, or kill it when ``stopped`` returns True.
 
     The command runs in its own session, so that Ctrl-C reaches only this process. Its standard
     input is a pipe that closes when this process dies (:mod:`vslam.cli.child`).

@@ -21,22 +21,18 @@ from vslam.report.schema import ReportJson
 class Cell:
     """One run in a benchmark's grid of sequences, perturbations, detectors and seeds.
 
-    The result of the run depends only on the attributes and on the images.
-
     Attributes:
         dataset: value of ``--dataset``.
-        sequence: name of the sequence.
         perturb: perturbation in canonical spelling, e.g. ``none`` or ``brightness:1.5,blur:0.5``.
-        detector: name of a loop detector of vslam, or name of another SLAM system.
+        detector: name of a loop detector of vslam, or of another SLAM system.
         seed: seed of the perturbation.
         max_frames: number of frames, counted from the first frame; None for all frames.
-        weights: weight file of a learned detector; None for the shipped weights. The file must have
-            the same path on every worker.
+        weights: weight file of a learned detector; None for the shipped weights. On a cluster, the
+            file must have the same path on every worker.
         digest: digest of the weight file.
         sensor: value of ``--sensor``; None to use all images of the data.
-        calib: paths of the calibration files that are given with ``--calib``.
-        thresholds: digest of the thresholds that differ from the defaults; empty if all thresholds
-            have their default values.
+        calib: calibration files that are given with ``--calib``.
+        thresholds: digest of the thresholds that differ from the defaults; empty if none differs.
     """
 
     dataset: str
@@ -53,7 +49,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Name of the folder for the results of this run. No two cells have the same name."""
+        """Name of the folder for the results of this run."""
         light = self.perturb.replace(":", "").replace(",", "+")
         parts = [self.dataset, self.sequence, light, self.detector, f"seed{self.seed}"]
         parts += [f"{self.max_frames}frames"] if self.max_frames else []
@@ -74,9 +70,9 @@ class Cell:
 
 
 def parse_sequences(text: str) -> list[str]:
-    """Parse a text with names and ranges of sequences.
+    """Parse names and ranges of sequences: ``00-02,05,demo`` gives ``00 01 02 05 demo``.
 
-    For example, ``00-02,05,demo`` gives ``00 01 02 05 demo``. Repeated names are removed.
+    Repeated names are removed.
 
     Raises:
         InputError: a range is reversed, or there is no name.
@@ -97,11 +93,10 @@ def parse_sequences(text: str) -> list[str]:
 
 
 def parse_perturbations(text: str) -> list[str]:
-    """Parse perturbations, such as ``none,brightness:2+blur``.
+    """Parse perturbations: ``none,brightness:2+blur`` gives ``none`` and ``brightness:2,blur:1``.
 
-    The result for this example is ``none`` and ``brightness:2,blur:1``. In the input, a comma
-    separates the perturbations of different runs. ``+`` joins perturbations that are applied
-    together in one run.
+    In the input, a comma separates the perturbations of different runs. ``+`` joins perturbations
+    that are applied together in one run.
 
     Raises:
         InputError: a part of the text is not a valid perturbation.
@@ -123,20 +118,18 @@ def make_grid(
     thresholds: str = "",
     repeated: Collection[str] = (),
 ) -> list[Cell]:
-    """Make all cells (runs) of a benchmark.
+    """List all cells (runs) of a benchmark.
 
-    The cells are in this order: all sequences with the first seed, then all sequences with the
-    second seed, and so on. In this order, the results of an interrupted benchmark are most useful.
+    The runs with the first seed come first, so that the results of an interrupted benchmark are
+    useful.
 
-    If a perturbation is not random, it is run with only one seed. Runs with other seeds would be
+    A perturbation that is not random is run with only one seed. Its runs with other seeds would be
     identical, and a statistical test would count them as independent samples.
 
     Args:
         runs: number of seeds.
-        weights: weight files by the name of the detector. Detectors without an entry use the
-            shipped weights.
-        repeated: names of the systems that are not deterministic. They are run with every seed,
-            even if the perturbation is not random.
+        weights: weight files by the name of the detector. Other detectors use the shipped weights.
+        repeated: names of the systems that are not deterministic. They are run with every seed.
     """
     paths = {name: str(path) for name, path in (weights or {}).items()}
     digests = {name: _digest(path) for name, path in (weights or {}).items()}
@@ -189,7 +182,7 @@ def draws(perturb: str) -> bool:
 
 
 def read_report(folder: Path) -> ReportJson | None:
-    """Read the report in the folder of a run; None if it is missing or has a different schema."""
+    """Read the report of a run. Return None if it is missing or has an unknown schema."""
     try:
         return ReportJson.read(folder / "report.json")
     except InputError:
@@ -197,7 +190,7 @@ def read_report(folder: Path) -> ReportJson | None:
 
 
 def tracked_nothing(folder: Path) -> bool:
-    """Return whether tracking was lost in every frame, according to the report in a run folder."""
+    """Return whether tracking was lost in every frame of the run in a folder."""
     report = read_report(folder)
     return report is not None and report.lost_frames + report.dropped_frames == report.frames
 

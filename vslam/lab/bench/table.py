@@ -19,12 +19,12 @@ from vslam.report.schema import ReportJson
 
 
 class GridProgress:
-    """The finished, failed and missing cells of a benchmark's grid. A cell is one run.
+    """The finished, failed and missing cells of a benchmark (one run each).
 
     Attributes:
         cells: all cells of the benchmark.
         reports: reports of the finished cells, in the order in which the cells ended.
-        failed: for each failed cell, one line that says why it failed.
+        failed: for each failed cell, the reason in one line.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class GridProgress:
 
     @property
     def missing(self) -> list[Cell]:
-        """Cells of the benchmark (one run each) that have neither finished nor failed."""
+        """Cells (runs) that have neither finished nor failed."""
         return [c for c in self.cells if c not in self.reports and c not in self.failed]
 
     def add(self, outcome: CellOutcome) -> str:
@@ -60,10 +60,9 @@ class GridProgress:
         return f"{len(self.reports) + len(self.failed)}/{len(self.cells)} {cell.name}: {result}"
 
     def table(self) -> Table:
-        """Return a table with the median ATE of the finished runs.
+        """Return a table with the number of finished runs and the median of their ATE.
 
-        There is a row for each sequence and perturbation, and a column for each detector. Each
-        entry of the table contains the number of finished runs and the median of their ATE.
+        There is a row for each sequence and perturbation, and a column for each detector.
         """
         detectors = list(dict.fromkeys(cell.detector for cell in self.cells))
         caption = "Each entry gives the number of finished runs and their median ATE.\n"
@@ -97,8 +96,7 @@ class GridProgress:
 def shown_live(progress: GridProgress, *, shown: bool) -> Iterator[Callable[[str], None]]:
     """Show the table of a benchmark on stderr, and update it while the benchmark runs.
 
-    The context manager yields a function that takes a line of text. The function prints the line
-    if stderr is not a terminal.
+    The context manager yields a function that prints a line of text if stderr is not a terminal.
 
     When the benchmark is complete, the table is erased, because the results are printed next. If
     runs are missing or have failed, the table stays.

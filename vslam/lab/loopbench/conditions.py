@@ -55,8 +55,8 @@ class Condition:
     def lateral(self) -> tuple[float, float]:
         """Range of the camera's lateral offset in metres, positive to the right.
 
-        Even without a change in viewpoint, there is a small offset, because no two drives follow
-        exactly the same line.
+        Without a change in viewpoint, there is a small offset, because no two drives follow exactly
+        the same line.
         """
         side = -_OTHER_LANE * self.view
         return (side, side) if self.view else (-0.3, 0.3)
@@ -69,10 +69,7 @@ class Condition:
 
     @property
     def change(self) -> float:
-        """Value of ``vslam synth --change`` with which the town is rendered.
-
-        The condition ``change`` has the value 0.5 at strength 0.5, and the value 0.9 at strength 1.
-        """
+        """Value of ``vslam synth --change`` with which the town is rendered."""
         strength = {"change": self.strength, "all": self.strength / 2}.get(self.kind)
         return 0.0 if strength is None else round(0.1 + 0.8 * strength, 3)
 
@@ -114,8 +111,7 @@ def apply(
     Args:
         condition: type and strength of the change. The type ``change`` has no effect here, because
             it is applied when the town is rendered.
-        images: the images, each ``(H, W)`` uint8.
-        seed: seed of all random values.
+        images: ``(H, W)`` uint8 images.
         rendered: whether the images were already rendered with the change in viewpoint.
     """
     out = list(images)
@@ -147,10 +143,7 @@ def turned(image: Image, degrees: float) -> Image:
 
 
 def clipped(image: Image, share: float, bright: bool) -> Image:
-    """Change the exposure of an image so that a given share of its pixels is clipped.
-
-    If ``bright`` is set, these pixels become white. Otherwise, they become black.
-    """
+    """Change the exposure so that a given share of the pixels becomes white, or else black."""
     grey = np.arange(256.0)
     if bright:
         white = max(float(np.quantile(image, 1.0 - share)), 1.0)
@@ -162,5 +155,4 @@ def clipped(image: Image, share: float, bright: bool) -> Image:
 
 
 def _sign(seed: int, k: int) -> float:
-    """Draw a sign, -1 or 1, for image ``k``."""
     return float(np.random.default_rng([seed, 30, k]).choice([-1.0, 1.0]))

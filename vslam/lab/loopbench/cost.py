@@ -1,7 +1,6 @@
 """Measures the CPU time and the memory of one loop detector in a separate process.
 
-CPU time is measured instead of wall time, because CPU time hardly depends on the load of the
-machine.
+Unlike wall time, CPU time hardly depends on the load of the machine.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ _REPEATS = 60
 
 
 def cost(name: str, weights: Path | None) -> Cost:
-    """Measure the CPU time and the memory of a loop detector in a new process."""
     command = [sys.executable, "-m", "vslam.lab.loopbench.cost", name, str(weights or "")]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return Cost.model_validate_json(done.stdout)

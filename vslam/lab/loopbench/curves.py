@@ -34,8 +34,7 @@ Line = tuple[str, Curve | DecisionCurve, str, str, str]
 def draw_curves(report: LoopsJson) -> list[page.Figure]:
     """Draw precision-recall curves: one figure for each set of images, and one for all drives.
 
-    The figure for a set of images has one panel per condition. A condition is a change that is
-    applied to the query images, with a given strength.
+    The figure for a set of images has one panel per condition (change of the query images).
     """
     return draw(_drawings(report))
 

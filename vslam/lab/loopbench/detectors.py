@@ -41,8 +41,8 @@ class DescribedImage:
         xy: ``(N, 2)`` float32 positions of the features in pixels.
         descriptors: ``(N, 32)`` uint8.
         words: ``(N,)`` int32 visual word of each feature.
-        nodes: direct index of the image. For each node of the vocabulary tree, it lists the
-            features whose visual words lie under this node.
+        nodes: direct index of the image, which lists the features under each node of the
+            vocabulary.
     """
 
     image: Image
@@ -87,7 +87,7 @@ class Scorer(Protocol):
 class BowScorer:
     """A bag-of-words detector that does not need a map.
 
-    It uses the same tf-idf weights and the same L1 score as `vslam.loopclosure.bow.BowDetector`.
+    It has the weights (tf-idf) and the score (L1) of `vslam.loopclosure.bow.BowDetector`.
     """
 
     name = "bow"
@@ -128,7 +128,7 @@ def require_comparable(name: str, weights: Path | None) -> None:
 
 
 def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scorer:
-    """Open the loop detector ``bow`` or one of the networks.
+    """Open the loop detector ``bow`` or one of ``NETWORKS``.
 
     Raises:
         InputError: the weights are missing or belong to a different network.
@@ -139,8 +139,7 @@ def open_scorer(name: str, weights: Path | None, vocabulary: Vocabulary) -> Scor
 class NetworkScorer:
     """A loop detector that runs one of ``NETWORKS`` on one thread.
 
-    Attributes:
-        parameters: number of learned parameters.
+    ``parameters`` is the number of learned parameters.
     """
 
     probability = True
@@ -167,10 +166,7 @@ class NetworkScorer:
 
 
 class LocalDescriptorCache:
-    """Local descriptors of images, which are computed once per image.
-
-    Only the coarse descriptors of `DescriptorMaps` are kept in memory.
-    """
+    """The coarse local descriptors of images, computed once per image."""
 
     def __init__(self) -> None:
         self._network: LocalDescriptors | None = None
@@ -178,8 +174,6 @@ class LocalDescriptorCache:
 
     def of(self, image: Image) -> DescriptorMaps:
         """Return the coarse local descriptors of an ``(H, W)`` uint8 grey image.
-
-        The descriptors are computed only if they are not in the cache.
 
         Raises:
             InputError: the local-descriptor network cannot be read.
@@ -198,8 +192,7 @@ class DetectorSet:
     """The loop detectors that are compared. The first detector is the baseline.
 
     Most conditions (changes of the query images) are measured on the same gallery images.
-    Therefore, the features of the last few sets of gallery images are cached, together with the
-    data that each detector stores for them.
+    Therefore, the features of the last few galleries are cached.
     """
 
     def __init__(self, scorers: list[Scorer], vocabulary: Vocabulary, threads: int) -> None:
@@ -209,10 +202,7 @@ class DetectorSet:
         self._kept: OrderedDict[bytes, tuple[list[DescribedImage], dict[str, Any]]] = OrderedDict()
 
     def gallery(self, images: list[Image]) -> tuple[list[DescribedImage], dict[str, Any]]:
-        """Return the features of gallery images, and the data that each detector stores for them.
-
-        The second result maps the name of each detector to its stored data.
-        """
+        """Return the features of gallery images, and the result of `Scorer.store` by detector."""
         hashed = hashlib.blake2b()
         for image in images:
             hashed.update(f"{image.shape}".encode())

@@ -36,7 +36,6 @@ def open_drives(
         spec: ``drive:ROUTE[seed=101,aliased=1,change=0.5,every=10]`` for a built-in route,
             ``kitti:DIR``, or ``fabmap:DIR``.
         cache: folder of rendered towns.
-        progress_bar: progress bar that is opened while a drive is rendered.
 
     Raises:
         InputError: ``spec`` does not name a drive, the route or an option is unknown, or the data
@@ -98,14 +97,13 @@ def render_views(
 ) -> None:
     """Render the left images of some frames into a folder in KITTI's layout.
 
-    Images that already exist are not rendered again. The images are identical to those of
-    `render_sequence`. The poses and times of the whole drive are also written. The file with the
-    poses is written last. Therefore, this file exists only if all images exist.
+    Images that already exist are not rendered again. The poses and times of the whole drive are
+    also written. The file with the poses is written last. Therefore, this file exists only if all
+    images exist.
 
     Args:
         root: output folder, which must not be used for other routes or variations.
         frames: indices of the frames to render, in ascending order.
-        threads: number of threads of the renderer.
         on_frame: called with the number of finished frames and the number of all frames.
 
     Raises:

@@ -127,10 +127,9 @@ def _score(
 def _best_images(
     scores: Matrix, relation: NDArray[np.int8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
-    """For each query, find the most similar image whose relation to the query is known.
+    """For each query, find the most similar gallery image whose relation to the query is known.
 
-    Returns the index of this image for each query, and whether it shows the same place as the
-    query or another place.
+    Returns the indices of these images, and their relations to the queries.
     """
     best = np.where(relation != UNKNOWN, scores, -np.inf).argmax(1)
     return best, relation[np.arange(len(best)), best]
@@ -139,11 +138,8 @@ def _best_images(
 def thinned(curve: PrecisionRecall) -> Curve:
     """Reduce the number of points of a precision-recall curve, using equal intervals of recall.
 
-    In each interval, only the point with the highest precision is kept. The last point of the
-    curve, at which every pair is accepted, is also kept.
-
     Equal steps in the number of accepted pairs would not be suitable. A good detector ranks the few
-    true pairs before thousands of false pairs. Nearly the whole curve would then lie within the
+    true pairs before thousands of false pairs, so that nearly the whole curve would lie within the
     first step.
     """
     points = drawn_points(curve)
@@ -154,10 +150,9 @@ def thinned(curve: PrecisionRecall) -> Curve:
 
 
 def drawn_points(curve: PrecisionRecall) -> NDArray[np.int64]:
-    """Select the points of a precision-recall curve that are drawn.
+    """Return the indices of the points of a precision-recall curve that are drawn.
 
-    These are the first point, and the points that are nearest to equal steps of recall. Returns the
-    indices of the points.
+    These are the first point, and the points that are nearest to equal steps of recall.
     """
     wanted = np.linspace(0.0, curve.recall[0], _CURVE_POINTS)
     reached = len(curve.recall) - 1 - np.searchsorted(curve.recall[::-1], wanted)
@@ -172,10 +167,9 @@ def _gain(
     found: dict[str, Matrix],
     relation: NDArray[np.int8],
 ) -> Gain:
-    """Compute by how much the average precision (AP) of two detectors differs.
+    """Compute the difference between the average precision (AP) of two detectors.
 
-    The result contains a 95 % confidence interval, which is computed by a bootstrap over the
-    queries.
+    The 95 % confidence interval is computed by a bootstrap over the queries.
     """
     known, rng = relation != UNKNOWN, np.random.default_rng(0)
 
@@ -198,9 +192,7 @@ def _gain(
 
 
 class Verification:
-    """Decides whether two images show the same place, using local features.
-
-    The decisions are cached."""
+    """Decides whether two images show the same place, using local features (with a cache)."""
 
     def __init__(
         self,
@@ -221,13 +213,11 @@ class Verification:
         return self._by_orb[key]
 
     def by_learned(self, query: int, image: int) -> bool:
-        """Return whether enough learned local descriptors of two images match.
+        """Return whether enough learned local descriptors of two images fit one homography.
 
-        There is one descriptor for each cell of a coarse grid of the image. The matches must also
-        fit one homography, with a large tolerance.
-
-        The limit is on the number of matching cells. A limit on their share would not be suitable,
-        because the share depends on how much of the images is sky or road.
+        There is one descriptor for each cell of a coarse grid of the image. The limit is on the
+        number of matching cells. The share of matching cells would depend on how much of the images
+        is sky or road.
         """
         key = query, image
         if key not in self._by_learned:
@@ -257,23 +247,20 @@ def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
 
 
 def sequence_scores(scores: Matrix) -> Matrix:
-    """Compute the similarity of sequences instead of single images (SeqSLAM).
+    """Compute the similarity of sequences of images (SeqSLAM; Milford and Wyeth, ICRA 2012).
 
-    The method is described by Milford and Wyeth, ICRA 2012.
-
-    A sequence that ends at a query is compared with a sequence that ends at a gallery image. In the
-    matrix of scores, the two sequences correspond to a straight line that ends at this pair of
-    images. The slope of the line is the ratio of the speeds of the two drives. Several slopes are
-    tried, and the scores along each line are averaged. The result is the highest of these mean
-    scores.
+    The scores are averaged along straight lines of the matrix of scores. Each line corresponds to
+    two sequences, one of queries and one of gallery images. The slope of the line is the ratio of
+    the speeds of the two drives. The result is the highest mean score over several slopes.
 
     Args:
         scores: ``(Q, G)`` scores of queries and gallery images, both in driving order. A higher
             score means more similar.
 
     Returns:
-        ``(Q, G)`` mean scores. If a line extends beyond the gallery, each missing score is replaced
-        with the mean score of the query. The lines of the first queries are shorter.
+        ``(Q, G)`` mean scores of the lines that end at each pair of images. If a line extends
+        beyond the gallery, each missing score is replaced with the mean score of the query. The
+        lines of the first queries are shorter.
     """
     n_queries, n_images = scores.shape
     usual = scores.mean(1)

@@ -28,11 +28,8 @@ def measure_drive(
 
     Args:
         drive: images in the order in which they were taken.
-        scorers: the loop detectors.
-        window: length of the window before a query. The images in this window are not compared with
-            the query.
-        vocabulary: vocabulary of the detector ``bow``. It is also used to match features for
-            verification.
+        window: the images just before a query, with which the query is not compared.
+        vocabulary: vocabulary of the detector ``bow`` and of the verification by ORB.
 
     Raises:
         InputError: no image shows the same place as an image before its window.

@@ -1,9 +1,8 @@
 """Matches features using the direct index of a vocabulary.
 
 Two features are compared only if their visual words lie under the same node of the vocabulary tree
-(Galvez-Lopez and Tardos, T-RO 2012, section IV). Loop closing compares all pairs of descriptors
-instead. Comparing all pairs finds a quarter more matches, but it is too slow for thousands of image
-pairs.
+(Galvez-Lopez and Tardos, T-RO 2012, section IV). Comparing all pairs of descriptors, as loop
+closing does, finds a quarter more matches. However, this is too slow for thousands of image pairs.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from vslam.kernels import hamming, kernel
 class NodeIndex(NamedTuple):
     """The features of an image, sorted by node of the vocabulary tree.
 
-    The node of a feature is the one under which the visual word of the feature lies.
+    The visual word of a feature lies under the node of the feature.
 
     Attributes:
         node: ``(N,)`` int32 node of each feature, ascending.
@@ -31,11 +30,10 @@ class NodeIndex(NamedTuple):
 
 
 def index_nodes(node: NDArray[np.int32]) -> NodeIndex:
-    """Make the direct index of an image, in which its features are sorted by vocabulary node.
+    """Sort the features of an image by node of the vocabulary tree.
 
     Args:
-        node: ``(N,)`` node of each feature: the node of the vocabulary tree under which the visual
-            word of the feature lies.
+        node: ``(N,)`` node under which the visual word of each feature lies.
     """
     order = np.argsort(node, kind="stable").astype(np.int32)
     return NodeIndex(node[order], order)
@@ -45,10 +43,7 @@ def index_nodes(node: NDArray[np.int32]) -> NodeIndex:
 def match_by_node(
     node_a, feature_a, descriptors_a, node_b, feature_b, descriptors_b, max_distance, ratio
 ):
-    """Match the features of two images.
-
-    Two features are compared only if their visual words lie under the same node of the vocabulary
-    tree.
+    """Match features of two images whose visual words lie under the same node of the vocabulary.
 
     Args:
         node_a, feature_a: direct index of image a (`NodeIndex`).
@@ -56,13 +51,12 @@ def match_by_node(
         node_b, feature_b: direct index of image b.
         descriptors_b: ``(N, 4)`` uint64 descriptors of all features of image b.
         max_distance: largest Hamming distance in bits.
-        ratio: largest ratio of two distances: the distance of the best match, divided by the
-            distance of the second best match under the same node. 1 disables this test.
+        ratio: largest ratio of the distances of the best and the second best match under the same
+            node. 1 disables this test.
 
     Returns:
-        ``(M,)`` int32. For each feature of image a, it contains the index of the matching feature
-        of image b, or -1 if there is no match. A feature of image b is matched at most once, with
-        the feature of image a whose descriptor is most similar.
+        ``(M,)`` int32. For each feature of image a, the index of the matching feature of image b,
+        or -1. A feature of image b is matched at most once, with the most similar feature.
     """
     matches = np.full(len(descriptors_a), -1, np.int32)
     distances = np.full(len(descriptors_a), 257, np.int64)

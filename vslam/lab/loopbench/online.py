@@ -37,7 +37,7 @@ class Window:
 
     Attributes:
         amount: length of the window, in images or in seconds.
-        timed: whether ``amount`` is in seconds. If not, ``amount`` is a number of images.
+        timed: whether ``amount`` is in seconds.
     """
 
     amount: float
@@ -49,12 +49,10 @@ class Window:
     def searchable(self, n: int, times: NDArray[np.float64] | None) -> NDArray[np.int64]:
         """For each image of a drive, count the images before its window.
 
-        These are the images with which the image is compared.
-
         Args:
             n: number of images in the drive.
             times: ``(n,)`` times of the images in seconds, ascending. If it is None, one image per
-                second is assumed. This is also the default of DLoopDetector.
+                second is assumed, as in DLoopDetector.
 
         Returns:
             ``(n,)`` int64 numbers of images.
@@ -110,8 +108,7 @@ def decide(scores: NDArray[np.float64], searchable: NDArray[np.int64]) -> Decisi
 
     Args:
         scores: ``(N, N)`` similarities of the images. Each row belongs to one query image.
-        searchable: ``(N,)`` for each image, the number of images before its window
-            (`Window.searchable`).
+        searchable: ``(N,)`` number of images before the window of each image (`Window.searchable`).
     """
     match, score = np.full(len(scores), -1, np.int64), np.full(len(scores), -np.inf)
     for k in np.flatnonzero(searchable):
@@ -126,12 +123,10 @@ class Judged:
 
     Attributes:
         score: ``(N,)`` float64 score of the match; -inf if there is no match.
-        right: ``(N,)`` bool, whether the match shows the same place as the image, according to the
-            ground truth.
+        right: ``(N,)`` bool, whether the match shows the same place as the image.
         far: ``(N,)`` bool, whether the match shows another place. A match is neither right nor far
             if it was taken near the image, but not near enough to count as the same place.
-        answerable: ``(N,)`` bool, whether an image before the window shows the same place, so that
-            a right match is possible.
+        answerable: ``(N,)`` bool, whether an image before the window shows the same place.
     """
 
     score: NDArray[np.float64]
@@ -151,11 +146,9 @@ def judge(
     """Compare the decisions of a loop detector for N images with the ground truth.
 
     Args:
-        decisions: the decisions for N images.
         relation: ``(N, N)`` int8. For each pair of images, 1 means that both show the same place,
             -1 means that they show different places, and 0 means that it is unknown.
-        searchable: ``(N,)`` for each image, the number of images before its window
-            (`Window.searchable`).
+        searchable: ``(N,)`` number of images before the window of each image (`Window.searchable`).
 
     Raises:
         InputError: no image shows the same place as an image before its window.
@@ -179,7 +172,6 @@ def decision_curve(judged: Judged, *, near_is_wrong: bool = True) -> PrecisionRe
     """Compute precision and recall for N images, using each distinct score as a threshold.
 
     Args:
-        judged: the decisions of a loop detector, compared with the ground truth.
         near_is_wrong: whether near matches count as wrong, as is usual in the literature. A near
             match was taken near the query, but the ground truth does not mark it as the same place.
             If False, near matches are left out.

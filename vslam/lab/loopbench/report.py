@@ -63,7 +63,7 @@ _ABOUT_DECISIONS = (
 
 
 def write_report(report: LoopsJson, out: Path) -> None:
-    """Write the report as ``loops.json``, ``loops.md`` and ``loops.html`` into the folder ``out``.
+    """Write ``loops.json``, ``loops.md`` and ``loops.html`` into the folder ``out``.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -117,7 +117,6 @@ def words(report: LoopsJson) -> list[str]:
 
 
 def tables(report: LoopsJson) -> list[Section]:
-    """Return all tables of the report of a comparison of loop detectors."""
     if not report.cells:
         return _online_tables(report.online)
     names = _detectors(report)
@@ -210,7 +209,6 @@ def _retrieval_table(
 
 
 def _online_tables(scores: Iterable[OnlineScore]) -> list[Section]:
-    """Return the tables for drives: recall at 100 % precision, the largest F1 score, and counts."""
     head = ("drive", "images", "with a match", "window", "verified by")
     texts = ("drive", "window", "verified by")
 
@@ -240,10 +238,9 @@ def _by_detector(
     """Return the head and the rows of a table that has one column for each loop detector.
 
     Args:
-        scores: results of all detectors.
         head: titles of the first columns.
-        about: function that takes a result and returns the entries of the first columns.
-        shown: function that takes a result and returns the entry in the column of its detector.
+        about: function that returns the entries of the first columns for a result.
+        shown: function that returns the entry in the column of the detector for a result.
     """
     rows: dict[tuple[str, ...], dict[str, str]] = {}
     for score in scores:
@@ -253,10 +250,7 @@ def _by_detector(
 
 
 def _online_words(scores: Iterable[OnlineScore]) -> list[str]:
-    """Return sentences that name the best detector for each drive and each kind of verification.
-
-    The best detector is the one with the highest recall at 100 % precision.
-    """
+    """Name the detector with the highest recall at 100 % precision, for each drive."""
     sentences = []
     for data in dict.fromkeys(s.data for s in scores):
         for by in ("nothing", "both"):

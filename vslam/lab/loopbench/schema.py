@@ -16,7 +16,7 @@ class Curve(Record):
 
 
 class Verified(Record):
-    """The result of geometric verification of the most similar gallery image of each query.
+    """The geometric verification of the most similar gallery image of each query.
 
     - ``right``: share of the queries whose most similar image passes verification and shows the
       same place. Only queries whose place is in the gallery are counted.
@@ -131,8 +131,8 @@ class Gain(Record):
 class Cost(Record):
     """Median costs of one loop detector, measured in a separate process with one thread.
 
-    - ``image_ms``: CPU time per image in milliseconds. The extraction of ORB features is not
-      included, because tracking needs these features in any case.
+    - ``image_ms``: CPU time per image in milliseconds, without the extraction of ORB features,
+      which tracking needs in any case.
     - ``query_ms``: CPU time per query in milliseconds. The key is the number of keyframes in the
       map.
     """
@@ -148,9 +148,8 @@ class Cost(Record):
 class LoopsJson(Document):
     """The results of ``vslam loops bench``, as in ``loops.json``.
 
-    ``kind`` distinguishes this file from reports of runs. With ``--protocol retrieval``, the
-    results are in ``cells``, ``gains`` and ``costs``. With ``--protocol online``, the results are
-    in ``online``.
+    With ``--protocol retrieval``, the results are in ``cells``, ``gains`` and ``costs``. With
+    ``--protocol online``, the results are in ``online``.
     """
 
     kind: Literal["loops"] = "loops"

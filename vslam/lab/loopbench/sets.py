@@ -30,12 +30,10 @@ class QuerySet:
     """Query images, gallery images in which their places are searched for, and the ground truth.
 
     Attributes:
-        queries: Q query images, each ``(H, W)`` uint8. The change of the condition has already been
-            applied to them.
+        queries: Q images, each ``(H, W)`` uint8, with the change of the condition.
         gallery: G unchanged images, each ``(H, W)`` uint8.
         relation: ``(Q, G)`` int8. 1 means that a query and a gallery image show the same place, and
-            -1 means that they show different places. 0 means that this is unknown. Such a pair is
-            left out.
+            -1 means that they show different places. Pairs with the value 0 (unknown) are left out.
         in_order: whether the queries and the gallery images are in the order of a drive.
     """
 
@@ -51,8 +49,8 @@ class TestSet:
 
     Attributes:
         title: title of the set in the report.
-        query_set: function of ``(condition, seed)`` that applies the change of a condition to the
-            query images, and returns all images of the set. It returns None if the change cannot be
+        query_set: function of ``(condition, seed)`` that returns the images of the set, with the
+            change of the condition applied to the query images. None if the change cannot be
             applied to this set.
     """
 
@@ -65,14 +63,13 @@ class TestSet:
 def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar) -> list[TestSet]:
     """Open a set of images for tests of loop detectors.
 
-    A town is rendered into ``cache`` when its images are first needed. For each change in viewpoint
-    and for each change of the town, the town is rendered separately.
+    A town is rendered into ``cache`` when its images are first needed. It is rendered again for
+    each change in viewpoint and for each change of the town.
 
     Args:
         spec: ``town:ROUTE[seed=101,aliased=1,places=150]`` for a rendered town. Otherwise, a source
             of images in the same spelling as for ``vslam train``.
         cache: folder of rendered towns.
-        progress_bar: progress bar that is opened while a town is rendered.
 
     Raises:
         InputError: the kind, route or an option is unknown, or the data is missing or malformed.

@@ -25,7 +25,7 @@ _OPTIONS = ("weights", "local_weights", "realtime", "map", "localize", "mask")
 
 @dataclass(frozen=True)
 class Found:
-    """The finished runs, in order, and notes on the runs that were left out.
+    """The finished runs, and notes on the runs that were left out.
 
     Attributes:
         estimate: for each run, the file with the estimated trajectory. The key is
@@ -43,11 +43,12 @@ class Found:
 def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
     """Read every run below ``folders``, and evaluate the trajectories of other SLAM systems.
 
-    ``trajectories`` contains the trajectories of other systems. They are evaluated on the same
-    sequences as the runs.
+    Interrupted runs are left out, as are reports that this version cannot read. The result has a
+    note for each run that was left out.
 
-    Interrupted runs are left out. Runs whose report this version cannot read are left out, too. The
-    result has a note for each run that was left out.
+    Args:
+        trajectories: trajectories of other systems on the sequences of the runs, each as a text
+            ``NAME[@SEQUENCE[@PERTURB]]=FILE``.
 
     Raises:
         InputError: a folder is missing, no folder contains a finished run, a trajectory cannot be
@@ -87,9 +88,9 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
 
 
 def read_aligned(found: Found, run: RunEntry) -> tuple[Trajectory, Trajectory | None]:
-    """Read the trajectory of a run, align it to the ground truth, and return both.
+    """Read the trajectory of a run, aligned to the ground truth, and the ground truth itself.
 
-    If there is no ground truth, None is returned in its place.
+    If there is no ground truth, the trajectory is not aligned, and the second result is None.
 
     Raises:
         InputError: a file is missing or malformed.
@@ -203,11 +204,10 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
 
 
 def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
-    """Return the settings of a run, which distinguish it from other runs of the same system.
+    """Return the thresholds and options that differ from the defaults, and the method's version.
 
-    The settings are the thresholds and options that differ from the defaults, and the version of
-    vslam's method. If the folder has no ``run.json``, it contains a run of another SLAM system.
-    Such a run has no settings.
+    If the folder has no ``run.json``, it contains a run of another SLAM system. Such a run has no
+    settings.
     """
     if not (folder / "run.json").exists():
         return {}
@@ -222,10 +222,7 @@ def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
 
 
 def _name_by_settings(found: Found) -> None:
-    """Treat runs with different settings as different systems, whose names list the settings.
-
-    Settings that are the same in all runs are not listed.
-    """
+    """Append the settings to the names of the systems, except settings that all runs share."""
     first = found.runs[0].settings
     shared = {
         name: value
@@ -307,9 +304,8 @@ def _add_external(text: str, found: Found) -> None:
 def _alignment_of_external(system: str, drive: Drive, found: Found) -> str:
     """Return the alignment (se3 or sim3) with which another system's trajectory is evaluated.
 
-    It is the alignment that is used for vslam's runs on the same sequence. If only some of these
-    runs are monocular, the name of the other system decides: the alignment is sim3 if the name ends
-    in ``, mono``, and se3 otherwise.
+    It is the alignment of vslam's runs on the same sequence. If some of these runs are monocular
+    and others are not, a name that ends in ``, mono`` gives sim3.
     """
     there = {run.alignment for run in found.runs if run.drive.place == drive.place}
     if len(there) == 1:

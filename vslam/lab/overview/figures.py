@@ -45,10 +45,7 @@ Looks = Mapping[str, tuple[str, Any]]  # colour and dashes of each system
 
 
 def draw_overview(report: OverviewJson, found: Found) -> list[page.Figure]:
-    """Draw all figures of a report of many runs, in the order of the report.
-
-    A figure is left out if there is no data for it.
-    """
+    """Draw the figures of a report of many runs. Figures without data are left out."""
     looks = {
         name: (_COLORS[k % len(_COLORS)], _DASHES[k % len(_DASHES)])
         for k, name in enumerate(systems(report.rows))
@@ -62,7 +59,6 @@ def draw_overview(report: OverviewJson, found: Found) -> list[page.Figure]:
 
 
 def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
-    """Draw the ATE of all systems on each sequence. There is one figure for each perturbation."""
     for perturb in dict.fromkeys(row.drive.perturb for row in rows):
         known = [r for r in rows if r.drive.perturb == perturb and r.measures["ate_rmse_m"]]
         places = list(dict.fromkeys((row.drive.dataset, row.drive.place) for row in known))
@@ -90,10 +86,7 @@ def _errors(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
 
 
 def _curves(rows: list[Row], looks: Looks) -> Iterator[Drawing]:
-    """Draw the ATE and the number of loops against the strength of a perturbation.
-
-    There is one figure for each combination of a kind of perturbation and a sequence.
-    """
+    """Draw the ATE and the number of loops against the strength of a perturbation."""
     laws = {
         law.partition(":")[0]: None
         for row in rows
@@ -152,10 +145,7 @@ def _curve(
 
 
 def _paths(report: OverviewJson, found: Found, looks: Looks) -> Iterator[Drawing]:
-    """Draw one trajectory of each system for each drive. There is one figure for each drive.
-
-    The trajectory is taken from the run that has the median ATE.
-    """
+    """Draw the trajectories of all systems on each drive, using the run with the median ATE."""
     for drive in dict.fromkeys(row.drive for row in report.rows):
         figure, axes = new_figure(
             f"{drive.place}, {_light(drive.perturb)}", "x (m)", "z (m)", SQUARE
@@ -207,10 +197,6 @@ def _spreads(rows: list[Row], measure: str) -> np.ndarray:
 
 
 def _logarithmic(axes: Axes) -> None:
-    """Make the y axis logarithmic, and label it with plain numbers.
-
-    The axis ends at a third of the smallest value and at three times the largest value.
-    """
     low, high = axes.dataLim.intervaly
     axes.set_yscale("log")
     axes.set_ylim(max(low, 1e-4) / 3.0, max(high, 1e-4) * 3.0)

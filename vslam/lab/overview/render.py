@@ -56,8 +56,8 @@ def write_overview(
         trajectories: trajectories of other systems, each as a text
             ``NAME[@SEQUENCE[@PERTURB]]=FILE``.
         out: output folder, which is created if it does not exist.
-        baseline: name of the system with which the other systems are compared; None for the
-            simplest system.
+        baseline: name of the system with which the others are compared; None for the simplest
+            system.
 
     Raises:
         InputError: there is no finished run, there is no run of the baseline, a trajectory cannot
@@ -93,7 +93,7 @@ def overview_page(report: OverviewJson, figures: Collection[Figure]) -> Page:
 
 
 def title(report: OverviewJson) -> str:
-    """Return one line with the names of the systems and the number of runs."""
+    """Return a title with the names of the systems and the number of runs."""
     places = len({(row.drive.dataset, row.drive.place) for row in report.rows})
     return (
         f"{', '.join(report.systems)}: {counted(len(report.runs), 'run')} on "
@@ -123,11 +123,7 @@ def render_csv(report: OverviewJson) -> str:
 
 
 def _results(report: OverviewJson) -> list[Section]:
-    """Return the tables with the results of all systems on all drives.
-
-    The results are divided into several tables with the same rows, because one table would be too
-    wide.
-    """
+    """Return the tables with the results. A single table would be too wide."""
     texts = ("sequence", "perturbation", "system")
 
     def table(name: str, measures: Collection[Measure], note: str, *, aligned: bool) -> Section:

@@ -31,8 +31,7 @@ ALL = "all"  # value of ``Comparison.perturb`` for a comparison over all perturb
 class Drive(Record):
     """A sequence with a perturbation, on which systems are compared.
 
-    ``excerpt`` states which part of the sequence is used. It is empty for the whole sequence. Runs
-    that differ only in their seed have the same drive.
+    ``excerpt`` states which part of the sequence is used; empty for the whole sequence.
     """
 
     dataset: str
@@ -50,16 +49,15 @@ class RunEntry(Record):
     """One run of a system on a drive, with its results.
 
     - ``system``: the name of vslam's loop detector or of another SLAM system. If runs of vslam have
-      different settings, the differing settings follow the name in brackets.
+      different settings, these settings follow in brackets.
     - ``settings``: thresholds and options that differ from the defaults, and the version of vslam's
       method.
     - ``seed``: seed of the perturbation; None for other systems.
-    - ``town``: seed of a rendered town. The same route in a different town counts as the same drive
-      with a different seed.
+    - ``town``: seed of a rendered town. Runs on the same route in different towns have the same
+      drive.
     - ``alignment``: the transformation that is fitted before errors are computed. It is ``se3``, or
       ``sim3`` for a monocular run, whose scale is arbitrary.
-    - ``measures``: results of the run. The keys are the names in ``MEASURES``. A value is None if
-      it is unknown.
+    - ``measures``: results of the run by the names in ``MEASURES``; None if unknown.
     - ``source``: the folder of the run. For another SLAM system, and for a detector that was added
       to a run with ``--compare``, it is the trajectory file instead.
     """
@@ -77,7 +75,7 @@ class RunEntry(Record):
 
 
 class Spread(Record):
-    """Median, smallest and largest value of a measure, over the ``n`` runs with a known value."""
+    """Median, smallest and largest value of a measure over the ``n`` runs whose value is known."""
 
     n: int
     median: float
@@ -111,11 +109,10 @@ class Pair(Record):
 class Comparison(Record):
     """A comparison of the errors of two systems under one perturbation, paired by sequence.
 
-    - ``perturb``: the perturbation, or ``all`` for a comparison over all perturbations. With
-      ``all``, each sequence counts once. The error on a sequence is then the mean over the
-      perturbations for which there are runs of both systems.
-    - ``p_value``: p-value of the two-sided Wilcoxon signed-rank test. Differences that are ties are
-      left out of the test. None if there are too few differences.
+    - ``perturb``: the perturbation, or ``all``. With ``all``, the error on a sequence is the mean
+      over the perturbations for which there are runs of both systems.
+    - ``p_value``: p-value of the two-sided Wilcoxon signed-rank test, without ties. None if there
+      are too few differences.
     - ``winner``: the system with significantly smaller errors; None if there is no such system.
     - ``words``: the result in sentences.
     """
@@ -138,7 +135,7 @@ class OverviewJson(Document):
     """The ``report.json`` of many runs.
 
     ``kind`` distinguishes this file from the ``report.json`` of a single run. ``systems`` begins
-    with the baseline. The other systems are compared with the baseline.
+    with the baseline.
     """
 
     kind: Literal["overview"] = "overview"

@@ -1,12 +1,12 @@
 """The web server of ``vslam report --serve``, which lists all runs in given folders.
 
-The server can only be reached from this machine. A request names a report by its number. The server
-never opens a path that comes from a request. Requests for a different host name are rejected.
-Otherwise, a web site could read reports through the user's browser (DNS rebinding).
+The server can only be reached from this machine. A request names a report by its number, so that
+the server never opens a path that comes from a request. Requests for a different host name are
+rejected. Otherwise, a web site could read reports through the user's browser (DNS rebinding).
 
 A report may come from an untrusted person and contain any script. Therefore, every report is
-sandboxed: the scripts of a report run in their own origin and cannot access other reports or the
-network. If a ``report.html`` or ``report.json`` is a symbolic link, the server does not read it.
+sandboxed: its scripts run in their own origin and cannot access other reports or the network.
+Reports that are symbolic links are not read.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _REPORT = re.compile("/run/([0-9]{1,9})")
 
 
 def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
-    """Find the folders of all runs and read their reports. The newest run comes first.
+    """Find all runs below the folders and read their reports. The newest run comes first.
 
     Reports that cannot be read are left out.
 
@@ -59,18 +59,17 @@ def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
 
 
 def _is_own(path: Path) -> bool:
-    """Return whether a path is a regular file. A symbolic link does not count as a file."""
+    """Return whether a path is a regular file, and not a symbolic link."""
     return path.is_file() and path.resolve() == path
 
 
 def make_server(folders: Sequence[Path], port: int = 0) -> http.server.ThreadingHTTPServer:
-    """Make a server on the loopback interface that shows all runs in the given folders.
+    """Make a server on the loopback interface that shows all runs below the given folders.
 
-    Call the method ``serve_forever`` to start the server. The folders are read again whenever a
-    browser requests the list of runs.
+    Call its method ``serve_forever`` to start it. The folders are read again whenever a browser
+    requests the list of runs.
 
     Args:
-        folders: folders that contain runs at any depth.
         port: port of the server; 0 for any free port.
 
     Raises:
@@ -108,10 +107,9 @@ def make_server(folders: Sequence[Path], port: int = 0) -> http.server.Threading
 
 
 class _Pages:
-    """The pages that the server shows.
+    """The pages of the server.
 
-    A browser requests a report by its number, which is the index of the report in ``_known``. The
-    number of a report never changes while the server runs.
+    The number of a report is its index in ``_known``. It never changes while the server runs.
     """
 
     def __init__(self, folders: Sequence[Path]) -> None:
@@ -121,7 +119,7 @@ class _Pages:
         self._list()
 
     def answer(self, request: str) -> tuple[int, str]:
-        """Return the HTTP status and the page for the path (with query string) of a request."""
+        """Return the HTTP status and the page for a request (path with query string)."""
         try:
             url = urlsplit(request)
             if url.path == "/":

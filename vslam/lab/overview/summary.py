@@ -1,9 +1,8 @@
 """Summarizes many runs, and compares systems.
 
-For each drive, the median over the runs of a system is used. Two systems are compared under each
-perturbation, and over all perturbations. A comparison pairs the errors of the two systems by
-*sequence*. It does not pair single runs, because runs on the same sequence are not independent.
-Treating them as independent samples would overstate the evidence.
+Each system is represented by the median over its runs on a drive. A comparison pairs the errors of
+two systems by *sequence*, and not by run. Runs on the same sequence are not independent, and
+treating them as independent samples would overstate the evidence.
 """
 
 from __future__ import annotations
@@ -53,12 +52,10 @@ ROTATION = {"rpe_deg": Shown("RPE", "°", 1.0, 3)}
 
 
 def summarize(found: Found, baseline: str | None = None) -> OverviewJson:
-    """Compute the content of the report of many runs from the runs.
+    """Compute the content of the report of many runs.
 
     Args:
-        found: the runs.
-        baseline: the system with which the other systems are compared; None for the simplest
-            system.
+        baseline: the system with which the others are compared; None for the simplest system.
 
     Raises:
         InputError: there is no run of the baseline.
@@ -107,9 +104,9 @@ def _unlike_towns(runs: Iterable[RunEntry]) -> Iterator[str]:
 def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list[str]:
     """Return the names of the systems in the order in which the report lists them.
 
-    If a baseline is given, it is the first system. It is followed by the loop detectors of vslam,
-    from the simplest to the most elaborate one. The other SLAM systems are at the end, in the order
-    of ``runs``. A detector with default settings precedes the same detector with other settings.
+    The baseline is first. The loop detectors of vslam follow, from the simplest to the most
+    elaborate one. Other SLAM systems are at the end. A detector with default settings precedes the
+    same detector with other settings.
     """
     names = dict.fromkeys(run.system for run in runs)
 
@@ -122,7 +119,7 @@ def systems(runs: Iterable[RunEntry | Row], baseline: str | None = None) -> list
 
 
 def _is_called(system: str, name: str | None) -> bool:
-    """Return whether a name that was given by the user is the name of a system.
+    """Return whether a name that the user gave refers to a system.
 
     The name may omit the settings of the system and the suffix ``, mono``.
     """
@@ -161,14 +158,15 @@ def compare(
 ) -> Comparison | None:
     """Compare the errors of two systems, paired by sequence.
 
+    Errors that were computed after different alignments are not compared.
+
     Args:
-        rows: for each drive and system, the medians over the runs. Rows of other systems than
-            ``first`` and ``second`` are ignored.
-        first, second: names of the systems. Errors that were computed after different alignments
-            are not compared.
-        perturb: a perturbation, or `ALL`. With `ALL`, the mean error on each sequence is compared.
-            The mean is over the perturbations for which there are runs of both systems.
-        measure: ``ate_rmse_m`` or ``rpe_m``. Smaller values are better.
+        rows: for each drive and system, the medians over the runs. Rows of other systems are
+            ignored.
+        first, second: names of the systems.
+        perturb: a perturbation, or `ALL`. With `ALL`, the error on a sequence is the mean over the
+            perturbations for which there are runs of both systems.
+        measure: ``ate_rmse_m`` or ``rpe_m``.
 
     Returns:
         The comparison; None if there is no drive for which there are runs of both systems.
@@ -220,12 +218,11 @@ def is_tie(difference: float, measure: str) -> bool:
 
 
 def strengths(drives: Iterable[Drive], law: str) -> dict[Drive, float]:
-    """Return with which strength each drive was perturbed.
+    """Return the strength of a perturbation for each drive that has no other perturbation.
 
-    Drives with other perturbations are left out. The strength is 0 for unperturbed drives.
+    The strength is 0 for unperturbed drives.
 
     Args:
-        drives: sequences with perturbations.
         law: name of the perturbation, without strength.
     """
     found = {}
@@ -246,10 +243,10 @@ def least_pairs() -> int:
 
 
 def _wilcoxon(differences: list[float]) -> tuple[float | None, bool]:
-    """Perform Wilcoxon's signed-rank test on paired differences.
+    """Perform Wilcoxon's signed-rank test (two-sided) on paired differences.
 
-    The test is two-sided. Returns the p-value, and whether the differences tend to be negative. The
-    p-value is None if there are too few differences.
+    Returns the p-value, and whether the differences tend to be negative. The p-value is None if
+    there are too few differences.
     """
     if len(differences) < least_pairs():
         return None, False
@@ -260,8 +257,6 @@ def _wilcoxon(differences: list[float]) -> tuple[float | None, bool]:
 
 
 def _words(found: Comparison, better: list[Pair], worse: list[Pair]) -> str:
-    """Describe the result of a comparison in sentences."""
-
     def named(some: list[Pair]) -> str:
         return ", ".join(pair.drive.place for pair in some)
 

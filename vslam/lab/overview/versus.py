@@ -32,9 +32,9 @@ Rows = dict[str, dict[Key, Row]]
 def versus(report: OverviewJson) -> list[Section]:
     """Make the sections of the report that compare systems and name the winner.
 
-    Two systems are in the same section if there are runs of both on the same drive, and if their
-    trajectories are aligned in the same way (se3 or sim3). If no drive revisits a place, the first
-    section explains why the results of loop detectors cannot differ.
+    Two systems are in the same section if they have a drive and an alignment (se3 or sim3) in
+    common. If no drive revisits a place, the first section explains why loop detectors cannot
+    differ.
     """
     rows: Rows = {name: {} for name in report.systems}
     for row in report.rows:
@@ -60,7 +60,7 @@ def median_text(spread: Spread | None, decimals: int) -> str:
 
 
 def _without_revisits(report: OverviewJson) -> str:
-    """Return a text that explains why loop detectors hardly differ if no place is revisited.
+    """Explain why loop detectors hardly differ if no drive revisits a place.
 
     The text is empty if a drive revisits a place, or if there is no ground truth.
     """
@@ -130,9 +130,8 @@ def _cell(row: Row | None, measure: str) -> str:
 def _points(report: OverviewJson, rows: Rows, names: list[str]) -> Iterator[str]:
     """Yield sentences that summarise the comparison of systems.
 
-    The first sentences give the total numbers of lost frames and of loops. Only drives for which
-    there are runs of all systems are counted. The other sentences compare each system with a
-    baseline, which is the first system in the list that has a drive in common with it.
+    Lost frames and loops are summed over the drives for which there are runs of all systems. Each
+    system is then compared with the first system in the list that has a drive in common with it.
     """
     shared = set.intersection(*(set(rows[name]) for name in names))
     runs = {

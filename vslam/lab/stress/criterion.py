@@ -16,10 +16,7 @@ ABSOLUTE = (
 
 
 def absolute_verdict(report: ReportJson) -> str:
-    """Return why a run exceeded the absolute limits; an empty text if it did not exceed them.
-
-    The absolute limits (``ABSOLUTE``) do not depend on the result of a run on unperturbed images.
-    """
+    """Return why a run exceeded the absolute limits (``ABSOLUTE``); empty if it did not."""
     if report.longest_loss_s is not None and report.longest_loss_s > _LOSS_S:
         return f"lost for {report.longest_loss_s:.0f} s"
     above = [limit for limit in _ERRORS_M if (report.ate_rmse_m or 0.0) > limit]
@@ -35,8 +32,7 @@ def lost_percent(report: ReportJson) -> float:
 class Criterion:
     """The limits beyond which a run counts as failed.
 
-    Some limits are relative to the *clean run*, which is a run of the same system on the
-    unperturbed images.
+    ``ate_factor`` is relative to the *clean run*: the run of the same system on unperturbed images.
 
     Attributes:
         lost_percent: largest allowed percentage of lost frames. Dropped frames are not counted.
@@ -51,7 +47,7 @@ class Criterion:
 
     @property
     def words(self) -> str:
-        """The limits, described in one sentence."""
+        """The limits in one sentence."""
         return (
             f"A run fails if more than {self.lost_percent:g} % of its frames are lost, if its ATE "
             f"is above {self.ate_least_m:g} m and above {self.ate_factor:g} times the ATE of the "
@@ -60,7 +56,7 @@ class Criterion:
         )
 
     def verdict(self, report: ReportJson, clean: ReportJson) -> str:
-        """Return why a run failed according to these limits; an empty text if it did not fail."""
+        """Return why a run failed; an empty text if it did not fail."""
         if (lost := lost_percent(report)) > self.lost_percent:
             return f"{lost:.0f} % lost"
         limit = self.ate_limit(clean)

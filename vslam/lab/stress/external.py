@@ -1,11 +1,9 @@
 """Runs other SLAM systems on perturbed images.
 
-Such a system reads a folder in KITTI's format and writes a trajectory.
-
 The command of a system is a template with the placeholders ``{folder}`` and ``{out}``. The folder
-at ``{folder}`` contains ``image_0``, ``image_1``, ``calib.txt`` and ``times.txt`` of the perturbed
-frames. Dropped frames are left out. The command must write these files into the folder at
-``{out}``:
+at ``{folder}`` is in KITTI's format. It contains ``image_0``, ``image_1``, ``calib.txt`` and
+``times.txt`` of the perturbed frames, without dropped frames. The command must write these files
+into the folder at ``{out}``:
 
 - ``trajectory.txt`` contains the estimated poses. It has either one pose per frame in KITTI's
   format, or poses with times in TUM's format.
@@ -55,7 +53,7 @@ def check_template(name: str, template: str) -> None:
     """Check the command template of a SLAM system.
 
     Raises:
-        InputError: a placeholder is missing or unknown.
+        InputError: a placeholder is missing or unknown, or the template cannot be split into words.
     """
     try:
         filled = template.format(folder="F", out="O")
@@ -91,7 +89,6 @@ def run_external(
 
     Args:
         template: command of the system, with ``{folder}`` and ``{out}``.
-        folder: output folder of the run.
 
     Raises:
         InputError: the system exits with an error, or writes no trajectory.
@@ -219,13 +216,13 @@ def _outcome(
 def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:
     """Read the poses that another SLAM system wrote.
 
-    An unknown pose is replaced with the last known pose before it. If there is no known pose before
-    it, the first known pose is used.
+    An unknown pose is replaced with the last known pose before it. If there is none, the first
+    known pose is used.
 
     Args:
         path: file in KITTI's or TUM's format.
         times: ``(N,)`` times of the frames in seconds.
-        kept: indices of the frames that the system received. Dropped frames are not among them.
+        kept: indices of the frames that the system received, without dropped frames.
 
     Raises:
         InputError: the file is malformed.

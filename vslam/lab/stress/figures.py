@@ -37,10 +37,7 @@ _PANELS = (
 
 
 def draw_curves(report: StressJson) -> list[page.Figure]:
-    """Draw the curves of a stress test, with one figure for each sequence and perturbation.
-
-    Stronger perturbations are further to the right.
-    """
+    """Draw lost frames, ATE and loops against strength, for each sequence and perturbation."""
     systems = list(dict.fromkeys(entry.system for entry in report.boundaries))
     colors = {name: _COLORS[k % len(_COLORS)] for k, name in enumerate(systems)}
     groups: dict[tuple[str, str], list[BoundaryEntry]] = {}

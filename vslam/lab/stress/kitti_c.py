@@ -27,7 +27,7 @@ class Corruption:
 
     @property
     def perturbations(self) -> list[str]:
-        """The values of ``--perturb`` in canonical spelling, weakest first."""
+        """The values of ``--perturb`` in canonical spelling."""
         return [parse_perturbation(spec, 0).name for spec in self.specs]
 
 

@@ -108,10 +108,7 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
 
 
 def _keep_first_of_each_time(path: Path) -> None:
-    """Keep only the first pose of each time in a trajectory file.
-
-    After tracking was lost, ORB-SLAM3 writes the poses of some frames twice.
-    """
+    """Remove repeated poses, which ORB-SLAM3 writes for some frames after tracking was lost."""
     by_time: dict[float, str] = {}
     for line in path.read_text().splitlines():
         by_time.setdefault(float(line.split()[0]), line)

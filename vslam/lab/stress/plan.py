@@ -57,7 +57,7 @@ class Search:
         return None if (position := self.position()) is None else self.cell(position)
 
     def advance(self, reports: Reports, criterion: Criterion) -> None:
-        """Judge the runs that have ended, and determine which strength is tested next."""
+        """Judge the runs that have ended."""
         clean = reports(self.clean)
         if not isinstance(clean, ReportJson):
             return
@@ -77,19 +77,16 @@ class Search:
 
 @dataclass(frozen=True)
 class Plan:
-    """A stress test: which searches are made, and the options of these searches.
+    """The searches of a stress test and their options.
 
     Attributes:
         clean: the run of each system on the unperturbed images of each sequence.
-        laws: names of the perturbations to test, without strengths. For each perturbation, a search
-            finds the strength at which runs fail.
+        laws: names of the perturbations to test, without strengths.
         seeds: number of seeds for each perturbation.
         steps: number of bisections in each search.
         baseline: name of the system with which the errors of other systems are compared, if there
             is a preset.
-        criterion: criterion that decides whether a run has failed.
-        repeated: names of the systems that are not deterministic. They are tested with every seed,
-            even if a perturbation is not random.
+        repeated: names of the systems that are not deterministic. They are tested with every seed.
         preset: ``kitti-c`` or None. With ``kitti-c``, the fixed severities of KITTI-C are tested
             instead of ``laws``.
     """
@@ -104,11 +101,9 @@ class Plan:
     preset: str | None = None
 
     def searches(self) -> list[Search]:
-        """Return all searches of the stress test.
+        """List the searches: one for each perturbation, system, sequence and seed.
 
-        There is one search for each perturbation, system, sequence and seed. If neither the
-        perturbation nor the system is random, only the first seed is used, because all seeds would
-        give the same result.
+        If neither the perturbation nor the system is random, only the first seed is used.
         """
         return [
             Search(clean, law, seed, self.steps)

@@ -34,13 +34,11 @@ _NOT_MONOTONE = (
 
 
 def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source]) -> None:
-    """Write all files of the report of a stress test.
+    """Write all files of the report of a stress test into the existing folder ``out``.
 
     Args:
-        out: an existing folder.
-        report: the results of the stress test.
-        sequences: sequences by name. Example images are taken from the first sequence of the
-            report. If ``sequences`` does not contain it, there are no example images.
+        sequences: sequences by name, from which example images are taken. If the first sequence of
+            the report is missing here, there are no example images.
 
     Raises:
         ResultsError: a file cannot be written.
@@ -61,7 +59,7 @@ def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source])
 
 
 def render_csv(report: StressJson) -> str:
-    """Write the results as CSV. Each line contains the result of one search."""
+    """Format the results as CSV, with one line for each search."""
     names = ("dataset", "sequence", "law", "unit", "system", "seed", "holds_to", "fails_at")
     lines: list[list[object]] = [[*names, "reason", "also_failed", "runs"]]
     for entry in report.boundaries:
@@ -72,7 +70,7 @@ def render_csv(report: StressJson) -> str:
 
 
 def title(report: StressJson) -> str:
-    """Return one line with the names of the systems and of the sequences."""
+    """Return a title with the names of the systems and of the sequences."""
     systems = list(dict.fromkeys(entry.system for entry in report.clean))
     places = list(dict.fromkeys(f"{entry.dataset} {entry.sequence}" for entry in report.clean))
     excerpt = f", {counted(report.max_frames, 'frame')}" if report.max_frames else ""
@@ -100,18 +98,14 @@ def stress_page(
 
 
 def boundary_sections(report: StressJson) -> list[Section]:
-    """Return the sections of the report that are also printed on the command line.
-
-    These sections contain the strengths at which each system fails. If there is a preset, they also
-    contain the errors for each corruption of the preset.
-    """
+    """Return the sections of the report that are also printed on the command line."""
     return [*_boundaries(report), *_preset(report)]
 
 
 def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]]:
     """Group the searches of a stress test by sequence, perturbation and system.
 
-    A group contains one search for each seed.
+    The searches in a group differ in their seed.
     """
     found: dict[tuple[str, str, str], list[BoundaryEntry]] = {}
     for entry in report.boundaries:
@@ -120,9 +114,9 @@ def groups(report: StressJson) -> dict[tuple[str, str, str], list[BoundaryEntry]
 
 
 def cell(entries: Collection[BoundaryEntry]) -> str:
-    """Format the strengths at which runs fail as a text, such as ``60 (50-75), 12 % lost``.
+    """Format the strength at which runs fail, for example as ``60 (50-75), 12 % lost``.
 
-    The range in parentheses contains the strengths of all seeds.
+    The value is the median over the seeds. The range is in parentheses.
     """
     if not entries:
         return ""
@@ -234,10 +228,9 @@ def _runs(report: StressJson) -> Table:
 
 
 def _sheet(report: StressJson, sequences: Mapping[str, Source]) -> list[Figure]:
-    """Draw the middle frame of the first sequence under each perturbation.
+    """Draw one frame of the first sequence under each perturbation.
 
-    The strength is the one at which the first system failed. If this system did not fail, the
-    greatest strength is used.
+    The strength is the one at which the first system failed, or else the greatest strength.
     """
     specs: dict[str, str] = {}
     first = next(iter(sequences), None)

@@ -37,7 +37,6 @@ class Results:
         return self._known[cell]
 
     def add(self, outcome: CellOutcome) -> None:
-        """Add the outcome of a cell (a run) that has ended."""
         if isinstance(outcome, Failed):
             self._known[outcome.cell] = outcome.message
         else:
@@ -53,12 +52,9 @@ def run_all(
     run: RunCells,
     say: Callable[[str], None] = lambda line: None,
 ) -> None:
-    """Run all cells (runs) of a stress test.
+    """Run all cells (one run each) of a stress test that are not finished yet.
 
-    The runs on unperturbed images come first. They are followed by the runs of all searches, in
-    rounds. The runs in ``others`` come last.
-
-    If an earlier command has already finished a run, this run is not repeated.
+    The runs on unperturbed images come first. The searches follow in rounds. ``others`` comes last.
     """
     _run(clean, results, run, say)
     while True:

@@ -1,7 +1,7 @@
 """The schema of ``stress.json``.
 
-The file contains no times and does not name the machine. Therefore, two stress tests with equal
-runs produce byte-identical files.
+The file contains no times and does not name the machine, so that equal runs produce byte-identical
+files.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ class Tested(Record):
     """One run of a stress test, at one strength of a perturbation.
 
     - ``verdict``: why the run failed; empty if it did not fail.
-    - ``absolute``: why the run exceeded the absolute limits; empty if it did not exceed them. The
-      absolute limits do not depend on the result of the run on unperturbed images.
+    - ``absolute``: why the run exceeded the absolute limits, which do not depend on the run on
+      unperturbed images; empty if it did not exceed them.
     """
 
     strength: float
@@ -48,7 +48,7 @@ class BoundaryEntry(Record):
 class CleanEntry(Record):
     """The run of a system on unperturbed images.
 
-    The limits beyond which other runs of this system count as failed are computed from this run.
+    ``ate_limit_m`` is the ATE above which the runs of this system on perturbed images fail.
     """
 
     dataset: str
@@ -67,10 +67,10 @@ class CorruptionEntry(Record):
 
     A value is None if vslam cannot apply the corruption, or if a run has no ATE.
 
-    - ``ate_sum_m``: sum of the ATE over the severities. For each severity, the median over the
-      seeds is used.
+    - ``ate_sum_m``: sum of the ATE over the severities. The ATE of a severity is the median over
+      the seeds.
     - ``error_percent``: ``ate_sum_m`` in percent of the ``ate_sum_m`` of the baseline.
-    - ``lost_percent``: the mean percentage of lost frames.
+    - ``lost_percent``: mean percentage of lost frames.
     """
 
     sequence: str

@@ -69,12 +69,12 @@ def bracket(failed: Mapping[float, bool], steps: int) -> tuple[float, float, flo
 def next_position(failed: Mapping[float, bool], steps: int) -> float | None:
     """Return the position that the bisection tests next; None at the end of the search.
 
-    A position is a strength on a scale from 0 (weakest) to 1 (greatest).
+    A position is a strength on a scale from 0 (weakest) to 1 (greatest). The greatest strength is
+    tested first. If the run fails, the interval is bisected ``steps`` times.
 
-    The greatest strength is tested first. If the run fails, the interval is bisected ``steps``
-    times. Bisection assumes that a system that passes a test also passes tests with a smaller
-    strength. The last test of a search checks this assumption: it takes place at half of the
-    greatest position at which the system did not fail. `bracket` describes the arguments.
+    Bisection assumes that a system that passes a test also passes tests with a smaller strength.
+    The last test of a search checks this assumption, at half of the greatest position at which the
+    system did not fail.
     """
     if 1.0 not in failed:
         return 1.0

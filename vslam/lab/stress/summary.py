@@ -102,7 +102,7 @@ def corruption_entries(
 ) -> list[CorruptionEntry]:
     """Compute the errors under each corruption of a preset, relative to a baseline.
 
-    The mean corruption error (mCE; Hendrycks and Dietterich, ICLR 2019) is computed from these
+    The mean corruption error (mCE; Hendrycks and Dietterich, ICLR 2019) is the mean of these
     errors.
     """
     systems = list(dict.fromkeys(cell.detector for cell in cells))

@@ -108,7 +108,7 @@ def track_motion(
     matches, inliers = 0, 0
     for widening in (1.0, 2.0, 4.0):
         window = widening * context.motion_window
-        matches = _match_previous(frame, previous, T_cw, context, window)
+        matches = _match_previous(frame, previous, T_cw, context, window, 1.0)
         if matches < config.min_inliers_motion:
             continue
         inliers = refine(frame, T_cw, context)
@@ -134,7 +134,9 @@ def track_sudden_motion(
     """
     config, sampling = context.config.tracking, context.config.relocalization
     least = config.min_inliers_motion
-    matches = _match_previous(frame, previous, T_cw, context, config.sudden_window)
+    matches = _match_previous(
+        frame, previous, T_cw, context, config.sudden_window, config.match_ratio
+    )
     if matches < least:
         return matches, 0
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
@@ -160,6 +162,7 @@ def _match_previous(
     T_cw: NDArray[np.float64],
     context: TrackingContext,
     window: float,
+    ratio: float,
 ) -> int:
     """Match the points of the previous frame near their projections, and return the number of
     matches.
@@ -192,7 +195,7 @@ def _match_previous(
         Projections(uvr, radius, low, high, before.descriptors[source].view(np.uint64)),
         np.ones(len(frame.features), np.bool_),
         context,
-        1.0,
+        ratio,
     )
     keep = consistent_orientation(before.angle[source[point]], frame.features.angle[feature])
     feature, point = feature[keep], point[keep]

@@ -27,7 +27,7 @@ from vslam.states import TrackerState
 
 
 class TrackerStatus(Enum):
-    """What the tracker knows about the position of the camera."""
+    """Whether the last frame was tracked, and from where the next frame can be tracked."""
 
     UNKNOWN = "unknown"
     """No frame has been tracked in this map. The camera may be anywhere in it."""
@@ -51,7 +51,7 @@ class Found:
         visible: ``(N,)`` int32 ids of the landmarks that the frame should see.
         keyframe: id of the keyframe at which the frame was relocalised; -1 if it was not
             relocalised.
-        is_doubtful: True if the frame has so few inliers that its matches with landmarks may be
+        is_doubtful: whether the frame has so few inliers that its matches with landmarks may be
             wrong.
     """
 
@@ -64,10 +64,9 @@ class Found:
 
     @classmethod
     def at_start(cls, frame: Frame, *, begun: bool) -> Found:
-        """Create the result for a frame that was not tracked because no map exists yet.
+        """Create the result for a frame that was not tracked because no map existed yet.
 
-        If the frame has started a map (``begun``), the state is OK, and all landmarks that the
-        frame created are inliers. Otherwise the state is LOST.
+        The state is OK if the frame has started a map (``begun``), and LOST otherwise.
         """
         n_landmarks = int(np.count_nonzero(frame.landmark >= 0))
         state = TrackingState.OK if begun else TrackingState.LOST
@@ -80,7 +79,7 @@ class Found:
 
     @property
     def relocalised(self) -> bool:
-        """Whether the pose of the frame was found by relocalisation, which is a search of the whole
+        """Whether the pose of the frame was found by relocalisation, which searches the whole
         map."""
         return self.keyframe >= 0
 
@@ -96,13 +95,12 @@ def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingS
 
 
 class Tracker:
-    """Tracks one frame after another. It reads only a ``MapView``, a copy of the map, not the map
-    itself.
+    """Tracks one frame after another. It reads only a ``MapView``, not the map itself.
 
     Attributes:
         status: whether the last frame was tracked or lost, or no frame has been tracked yet.
-        last: the last frame that was tracked; None before a frame was tracked.
-        lost_frames: number of frames that were lost since the frame ``last``.
+        last: the last frame that was tracked; None until a frame has been tracked.
+        lost_frames: number of frames that have been lost since the frame ``last``.
     """
 
     def __init__(self, context: TrackingContext) -> None:
@@ -121,7 +119,7 @@ class Tracker:
         return self._resumed_twist if self.last is None else self.last.twist
 
     def predict(self, timestamp: float, frames: FramePoses, view: MapView) -> Matrix:
-        """Predict the pose of the camera at a given time.
+        """Predict the ``(4, 4)`` pose of the camera (world to camera) at a given time.
 
         The camera is assumed to keep its velocity. The velocity is measured per second, not per
         frame, so that dropped frames do not distort the prediction. If no frame has been tracked
@@ -130,9 +128,6 @@ class Tracker:
         Args:
             timestamp: seconds.
             frames: poses of all earlier frames, including lost frames.
-
-        Returns:
-            ``(4, 4)`` pose ``T_cw`` (world to camera).
         """
         if not len(frames):
             return view.T_reference
@@ -143,11 +138,13 @@ class Tracker:
         return orthonormalised(se3_exp(self.twist * elapsed) @ T_last)
 
     def track_patches(self, frame: Frame, T_cw: Matrix, view: MapView) -> Found:
-        """Track a frame using the image patches of landmarks, without extracting features. ``T_cw``
-        is the predicted ``(4, 4)`` pose (world to camera).
+        """Track a frame using the image patches of landmarks, without extracting features.
 
-        The result is LOST if too few patches are found. It is also LOST if the frame cannot be
-        tracked in this way, for example because the previous frame was not tracked.
+        The result is LOST if too few patches are found, or if the frame cannot be tracked in this
+        way, for example because the previous frame was not tracked.
+
+        Args:
+            T_cw: ``(4, 4)`` predicted pose (world to camera).
         """
         last, config = self.last, self._config.tracking
         if frame.pyramid is None or frame.source is None or not len(view.patches.ids):
@@ -188,10 +185,8 @@ class Tracker:
         return judge(n_matches, n_inliers, self._context) != TrackingState.LOST
 
     def track(self, frame: Frame, T_cw: Matrix, view: MapView, frames: FramePoses) -> Found:
-        """Track a frame using its features.
-
-        First, the frame is tracked against the last frame or the reference keyframe. Then it is
-        tracked against all landmarks of the local map.
+        """Track a frame using its features, first against the last frame or the reference keyframe,
+        and then against all landmarks of the local map.
 
         Args:
             T_cw: ``(4, 4)`` predicted pose (world to camera).
@@ -229,7 +224,7 @@ class Tracker:
         self.last, self.lost_frames, self.status = frame, 0, TrackerStatus.TRACKING
 
     def lose(self) -> None:
-        """Count a frame that was not tracked as lost, and update the state of the tracker."""
+        """Count a frame as lost."""
         self.lost_frames += 1
         self.status = TrackerStatus.LOST
 
@@ -242,8 +237,7 @@ class Tracker:
         self.status, self._resumed_twist = TrackerStatus.RESUMED, twist
 
     def state(self) -> TrackerState | None:
-        """Return the state between two frames, to save it in a checkpoint. Returns None before the
-        first frame is tracked."""
+        """Return the state for a checkpoint, or None before the first frame is tracked."""
         last = self.last
         if last is None:
             return None
@@ -260,7 +254,7 @@ class Tracker:
         )
 
     def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
-        """Restore a state that the method ``state`` returned. Returns the last tracked frame.
+        """Restore the state of a checkpoint. Returns the last tracked frame.
 
         Args:
             xyz: ``(N, 3)`` positions of the landmarks that the last frame tracks, in the world
@@ -284,10 +278,9 @@ class Tracker:
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
         """Find a first pose and first matches of a frame. Returns the number of inliers.
 
-        If the motion is known, the frame is tracked against the last frame, using the predicted
-        pose. If the motion is unknown or tracking against the last frame fails, the frame is
-        tracked against the reference keyframe. If that fails too and the motion is known,
-        ``_track_predicted`` is called.
+        The frame is tracked against the last frame if the motion is known, then against the
+        reference keyframe, and finally against the local map at the predicted pose, until one of
+        them succeeds.
         """
         if self.last is None and self.status is not TrackerStatus.RESUMED:
             return 0
@@ -323,12 +316,12 @@ class Tracker:
         return n_inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * n_matches)
 
     def _is_doubtful(self, frame: Frame, n_inliers: int, view: MapView, frames: FramePoses) -> bool:
-        """Return whether a frame is doubtful. A frame is doubtful if it has so few inliers that its
-        matches may be wrong and there is another reason for doubt.
+        """Return whether a frame is doubtful: it has few inliers, and there is another reason why
+        its matches may be wrong.
 
-        There are three such reasons. The first is a gap in time. The second is an unknown motion,
-        because the pose was then not predicted. The third is a sudden drop in the number of
-        inliers, for example after the camera was carried away.
+        There are three such reasons: a gap in time; an unknown motion, because the pose was then
+        not predicted; and a sudden drop in the number of inliers, for example after the camera was
+        carried away.
         """
         if self.last is None:
             return False
@@ -349,8 +342,8 @@ def result_of(
     stage_ms: dict[str, float],
     odometry: Odometry,
 ) -> TrackResult:
-    """Create the ``TrackResult`` of a frame, which the library returns to its caller. ``stage_ms``
-    is the time that each stage took, in milliseconds."""
+    """Create the ``TrackResult`` of a frame. ``stage_ms`` is the time that each stage took, in
+    milliseconds."""
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,

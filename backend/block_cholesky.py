@@ -1,14 +1,12 @@
 """Sparse Cholesky factorisation of symmetric systems with one row of 6x6 blocks per keyframe.
 
-The structure of the matrix is analysed once for all iterations of an optimiser. The analysis
-computes a minimum degree elimination order (George and Liu, "The evolution of the minimum degree
-ordering algorithm", SIAM Review 1989) and the fill-in. The elimination is simulated on bit sets, so
-that the degrees are exact. This is feasible for a few thousand keyframes. The neighbours that a
-keyframe still has when it is eliminated give the nonzero blocks of its column in the factor.
+The structure of the matrix is analysed once for all iterations of an optimiser. The analysis finds
+a minimum degree elimination order (George and Liu, "The evolution of the minimum degree ordering
+algorithm", SIAM Review 1989). It also finds the fill-in. The elimination is simulated on bit sets,
+which is feasible for a few thousand keyframes.
 
 The numeric factorisation is left-looking (Davis, "Direct Methods for Sparse Linear Systems",
-section 4.8) and works on blocks. The result is deterministic: the same input produces
-byte-identical output on every run.
+section 4.8) and works on blocks. The same input produces byte-identical output on every run.
 """
 
 from __future__ import annotations

@@ -50,7 +50,8 @@ class BundleProblem:
     disparity_weight: NDArray[np.float64] | None = None
 
     def disparity_weights(self) -> NDArray[np.float64]:
-        """Return the ``(O,)`` float64 disparity weights, also if ``disparity_weight`` is None."""
+        """Return ``disparity_weight``, or ``(O,)`` times the ratio in ``intrinsics`` if it is
+        None."""
         if self.disparity_weight is not None:
             return self.disparity_weight
         return np.full(len(self.camera), self.intrinsics[5])
@@ -297,9 +298,11 @@ def linearise(T_cw, n_free, points, observations, equations):
 
 @inner_kernel
 def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
-    """Eliminate the points by the Schur complement. Writes the upper triangle of S and the
-    right-hand side of the reduced camera system ``S x = rhs``, and the inverses of the damped point
-    blocks."""
+    """Eliminate the points from the normal equations by the Schur complement.
+
+    The upper triangle of the reduced camera system ``S x = rhs`` is written into ``S`` and ``rhs``.
+    The inverses of the damped point blocks are written into ``V_inverse``.
+    """
     first, camera, used = observations.first, observations.camera, observations.used
     W, V, g, U, b = equations
     S[:] = 0.0

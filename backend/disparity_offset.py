@@ -1,9 +1,9 @@
 """Estimates a constant error of all disparities of a stereo pair from the motion of the camera.
 
 Two calibration errors cause such an offset. The rotation between the two cameras may be wrong by
-some hundredths of a degree, or a principal point may be wrong by a tenth of a pixel. Both errors
-shift all disparities by nearly the same amount. Depths are then wrong by a fraction that grows with
-the depth.
+some hundredths of a degree. A principal point may be wrong by a tenth of a pixel. Both errors shift
+all disparities by nearly the same amount. Depths are then wrong by a fraction that grows with the
+depth.
 
 The offset cannot be determined from a single stereo pair. It can be determined from a moving
 camera, because one motion must explain how both near and far points move in the image. Therefore,

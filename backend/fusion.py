@@ -32,11 +32,12 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
 
 
 def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
-    """Return the ids of the neighbours of a keyframe whose landmarks are fused with its landmarks
+    """Return the ids of the keyframes whose landmarks are fused with the landmarks of a keyframe
     (ORB-SLAM2).
 
-    They are the ``mapping.fuse_neighbours`` keyframes that share the most landmarks with the
-    keyframe, and the five keyframes that share the most landmarks with each of these.
+    First, they are the ``mapping.fuse_neighbours`` keyframes that share the most landmarks with the
+    keyframe. For each of these keyframes, the five keyframes that share the most landmarks with it
+    are added.
     """
     first, _ = map_.covisible(keyframe)
     chosen = first[: config.mapping.fuse_neighbours].tolist()
@@ -57,16 +58,16 @@ def fuse_loop(
     camera: Camera,
     config: Config,
 ) -> int:
-    """Fuse the landmarks on one side of a loop with the landmarks on the other side, after the loop
-    was corrected (section VII-D of the ORB-SLAM paper).
+    """Fuse the landmarks on the two sides of a loop, after the loop was corrected (section VII-D of
+    the ORB-SLAM paper).
 
     The matches of loop verification are fused first. Then the landmarks of each side are projected
     into the keyframes of the other side.
 
     Args:
         edge: the loop. Its ``features`` and ``landmarks`` must be set.
-        query_side, match_side: ids of the keyframes around the two ends of the loop. The poses of
-            these keyframes must already be corrected.
+        query_side, match_side: ids of the keyframes around the two ends of the loop. Their poses
+            must already be corrected.
 
     Returns:
         Number of fusions.

@@ -107,10 +107,9 @@ def adjust_globally(
 def working_order(first, rank, n_cameras):
     """Sort points and observations for cache-friendly access to the reduced camera system.
 
-    The observations of a point are sorted by the elimination order of their cameras, so that the
-    earlier of two observations determines the column of their block, and the later one the row.
-    Points are sorted by their first camera, so that blocks that are written one after another are
-    close together in memory.
+    The observations of a point are sorted by the elimination order of their cameras. Points are
+    sorted by their first camera. Blocks that are written one after another are then close together
+    in memory.
 
     Args:
         first: ``(P + 1,)``, see ``BundleProblem``.
@@ -241,8 +240,11 @@ def pair_slots(structure, first, camera, n_free):
 def reduce_points_sparsely(
     structure, slots, n_free, observations, equations, damping, S, x, V_inverse
 ):
-    """Eliminate the points by the Schur complement. Writes the reduced camera system ``S x = rhs``:
-    S as panels of ``block_cholesky``, and the right-hand side into ``x``."""
+    """Eliminate the points from the normal equations by the Schur complement.
+
+    The reduced camera system is ``S x = rhs``. Its matrix is written into ``S`` as panels of
+    ``block_cholesky``, and its right-hand side into ``x``.
+    """
     first, camera = observations.first, observations.camera
     W, V, g, U, b = equations
     for i in range(len(S)):

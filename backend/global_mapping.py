@@ -94,10 +94,9 @@ def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution
     """Apply the result of global bundle adjustment to the map, which may have changed since the
     snapshot.
 
-    Newer keyframes keep their pose relative to their parent in the spanning tree (Mur-Artal and
-    Tardós, ORB-SLAM2, section III-D), and newer landmarks move with their anchor keyframe.
-    Observations that failed the chi-square test are removed, unless their features have been
-    assigned to other landmarks since.
+    Newer keyframes keep their pose relative to their parent in the spanning tree (ORB-SLAM2,
+    section III-D). Newer landmarks move with their anchor keyframe. Observations that failed the
+    chi-square test are removed, unless their features have been assigned to other landmarks since.
     """
     a = map_.arrays
     T_cw_old = a.T_cw[: map_.n_keyframes].copy()

@@ -14,11 +14,11 @@ The error of GPS is mostly a bias that changes slowly, which is caused by the at
 reflections. A hundred fixes in ten seconds therefore provide little more information than a single
 fix. For this reason, all fixes within ``CORRELATION_S`` together have the weight of a single fix.
 
-The drift of a metric map depends on the camera, its calibration and the loops that were closed, but
-the pose graph has a single drift model for all maps. With this model, a map with little drift would
-be bent towards the bias of the fixes. Therefore, the standard deviations of all tree and
-covisibility edges are multiplied by the factor, out of ``_DRIFTS``, that maximises the marginal
-likelihood of the fixes (empirical Bayes: MacKay, Bayesian Interpolation, 1992).
+The drift of a metric map depends on the camera, its calibration and the loops that were closed.
+However, the pose graph has a single drift model for all maps. With this model, a map with little
+drift would be bent towards the bias of the fixes. Therefore, the standard deviations of all tree
+and covisibility edges are multiplied by a common factor. The factor that maximises the marginal
+likelihood of the fixes is chosen (empirical Bayes: MacKay, Bayesian Interpolation, 1992).
 """
 
 from __future__ import annotations
@@ -202,9 +202,9 @@ def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> 
     """Align a map with its GPS fixes using RANSAC.
 
     The scale of a metric map is estimated as well, because the calibration may be inaccurate. The
-    estimate is the mean of the scale that the fixes suggest and of the calibrated scale, which is
-    1, weighted by their inverse variances. ``_METRIC`` is the standard deviation of the calibrated
-    scale.
+    result is a weighted mean of two scales: the scale that the fixes suggest, and the calibrated
+    scale, which is 1. The weights are the inverse variances. ``_METRIC`` is the standard deviation
+    of the calibrated scale.
 
     Args:
         T_wk: ``(N, 4, 4)`` poses of the keyframes in the map (camera to world).

@@ -68,9 +68,9 @@ def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
     """Run local bundle adjustment around a keyframe (section VI-D of the ORB-SLAM paper).
 
     The keyframe, its covisible keyframes and all landmarks that these keyframes observe are
-    optimised. Other keyframes that observe these landmarks are held fixed, and so is the first
-    keyframe of the map, which defines the world frame. Afterwards, observations that fail the
-    chi-square test are removed.
+    optimised. Other keyframes that observe these landmarks are held fixed. The first keyframe of
+    the map is also held fixed, because it defines the world frame. Afterwards, observations that
+    fail the chi-square test are removed.
     """
     free, fixed, landmarks = local_window(map_, keyframe, config)
     problem, rows = assemble(map_, free, fixed, landmarks, camera)
@@ -122,8 +122,12 @@ def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.in
 
 @kernel
 def window_landmarks(a, window, n_landmarks, n_keyframes):
-    """Return the ``(P,)`` int32 ids of the landmarks that the keyframes of a window observe, and a
-    ``(K,)`` bool mask of the other keyframes that observe these landmarks."""
+    """Find the landmarks that the keyframes of a window observe, and the other keyframes that
+    observe them.
+
+    Returns:
+        The ``(P,)`` int32 ids of the landmarks, and a ``(K,)`` bool mask of the other keyframes.
+    """
     seen = np.zeros(n_landmarks, np.bool_)
     others = np.zeros(n_keyframes, np.bool_)
     for keyframe in window:
@@ -188,11 +192,10 @@ def remove_observations(a, rows):
 
 
 def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Cull redundant keyframes among the covisible keyframes of a keyframe.
+    """Cull redundant keyframes among the covisible keyframes of a keyframe (section VI-E of the
+    ORB-SLAM paper).
 
-    A keyframe is redundant if most of its close landmarks are also observed by at least three other
-    keyframes, at a finer or about the same scale (section VI-E of the ORB-SLAM paper). For a
-    monocular camera, all landmarks count as close.
+    A keyframe is redundant if most of its close landmarks are redundant (``count_redundant``).
     """
     neighbours, shared = map_.covisible(keyframe)
     close = config.stereo.close_depth_baselines * camera.baseline
@@ -207,7 +210,7 @@ def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 
 @kernel
 def count_redundant(a, keyframe, bf, close_depth):
-    """Count the close landmarks of a keyframe, and how many of these landmarks are redundant.
+    """Count the close landmarks of a keyframe, and count how many of these landmarks are redundant.
 
     A landmark is redundant if at least three other keyframes observe it at a finer or about the
     same scale. If ``bf`` is 0 (monocular camera), all landmarks count as close.

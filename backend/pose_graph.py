@@ -198,9 +198,9 @@ def edge_sigmas(
     Therefore, the variance of an edge is multiplied by the number of edges that span the path at
     its ends.
 
-    The translation of a GAP edge may be wrong by a fraction of the predicted distance, or by the
-    distance that a slow car travels in the elapsed time. The larger error is used. A WEAK edge has
-    very large standard deviations.
+    For the translation of a GAP edge, two possible errors are compared: a fraction of the predicted
+    distance, and the distance that a slow car travels in the elapsed time. The larger error is
+    used. A WEAK edge has very large standard deviations.
 
     Args:
         seconds: ``(E, 2)`` timestamps of the ends of the edges.

@@ -4,11 +4,11 @@ FAST places a corner at a whole pixel of a pyramid level, so a corner is typical
 pixel. When the camera approaches the scene, this error is biased towards the focus of expansion
 (docs/research/motorway.md).
 
-To remove the error, a patch from a keyframe that observed the landmark is warped into the view of
-the frame and shifted until it agrees with the image. This is the "feature alignment" of SVO
-(Forster et al., ICRA 2014, section III-B). The method is inverse compositional Lucas-Kanade (Baker
-and Matthews, IJCV 2004, section 3.2). Changes in brightness and contrast are estimated together
-with the shift.
+To remove the error, the patch is taken from a keyframe that observed the landmark. The patch is
+warped into the view of the frame and shifted until it agrees with the image. This is the "feature
+alignment" of SVO (Forster et al., ICRA 2014, section III-B). The method is inverse compositional
+Lucas-Kanade (Baker and Matthews, IJCV 2004, section 3.2). Changes in brightness and contrast are
+estimated together with the shift.
 """
 
 from __future__ import annotations

@@ -22,11 +22,11 @@ def columns_of_depth(
     in pixels.
 
     A keypoint at column u with depth d gets the column ``u - fx b / d``. A constant error in pixels
-    then corresponds to a depth error that grows with the square of the depth, as it does in
-    structured-light cameras.
+    then corresponds to a depth error that grows with the square of the depth. Structured-light
+    cameras have such errors.
 
     Keypoints at a depth discontinuity get no column. Where the contour of a near object crosses the
-    background, a corner is not a point of the scene, but slides along the contour as the camera
+    background, a corner is not a point of the scene. It slides along the contour as the camera
     moves.
 
     Args:

@@ -150,7 +150,7 @@ def select_model(
     xy_1: Matrix, xy_2: Matrix, sigma: Matrix, config: InitializationConfig, *, seed: int
 ) -> TwoViewModel:
     """Fit a homography and a fundamental matrix to the matches, and select one of them by its score
-    (section IV of the ORB-SLAM paper, steps 2 and 3).
+    (ORB-SLAM paper, section IV, steps 2 and 3).
 
     Args:
         xy_1, xy_2: ``(N, 2)`` matched pixels, N at least 8.
@@ -250,12 +250,12 @@ def score_homographies(
 def score_fundamentals(
     F: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
 ) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Score B fundamental matrices by the distances from the epipolar lines in both views. Returns
-    ``(B,)`` scores and a ``(B, N)`` bool mask of the inliers.
+    """Score B fundamental matrices by the distances from the epipolar lines in both views (section
+    IV of the ORB-SLAM paper). Returns ``(B,)`` scores and a ``(B, N)`` bool mask of the inliers.
 
     The inlier threshold is ``CHI2_LINE``, because the distance from a line has one degree of
     freedom. A perfect match has the same score as with a homography, so that the scores of both
-    models can be compared (section IV of the ORB-SLAM paper).
+    models can be compared.
     """
     one = np.ones((len(xy_1), 1))
     p_1, p_2 = np.hstack([xy_1, one]), np.hstack([xy_2, one])

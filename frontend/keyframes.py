@@ -205,14 +205,13 @@ class KeyframePolicy:
         """Return whether the place that the frame shows is already mapped, so that a new keyframe
         would repeat an old one.
 
-        The frame must track as many landmarks as is expected of a frame next to the old keyframe,
-        and it must share enough of these landmarks with the old keyframe. A lack of close points is
-        not a reason to map a known place again, because the old keyframe did not provide more close
-        points.
+        Two conditions must hold. The frame must track as many landmarks as is expected of a frame
+        next to the old keyframe. It must also share enough of these landmarks with the old
+        keyframe. A lack of close points is not a reason to map a known place again.
 
-        In addition, the frame must have a minimum number of inliers. Otherwise, no keyframe would
-        be made when the camera moves beyond the end of a map, because the last keyframe of a map
-        has few landmarks that at least three keyframes observe.
+        In addition, the frame must have a minimum number of inliers. The last keyframe of a map has
+        few landmarks that at least three keyframes observe. Without the minimum, no keyframe would
+        be made when the camera moves beyond the end of the map.
 
         Args:
             n_inliers: number of landmarks that the frame tracks.

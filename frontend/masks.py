@@ -60,7 +60,7 @@ class Mask:
         return self.levels.pixels[at] > 0
 
     def filled(self, image: Image) -> Image:
-        """Copy an ``(H, W)`` uint8 image, with the mean grey value of the other pixels in all
-        masked pixels. The copy is for networks that read the whole image."""
+        """Copy an ``(H, W)`` uint8 image, and give all masked pixels the mean grey value of the
+        other pixels. The copy is for networks that read the whole image."""
         mean = np.uint8(image[self.used].mean()) if self.used.any() else np.uint8(0)
         return np.where(self.used, image, mean)

@@ -23,9 +23,9 @@ ORIENTATION_BINS = 30
 def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scales, window):
     """Predict where landmarks appear in an image (section V-D of the ORB-SLAM paper).
 
-    A landmark is visible if it projects into the image, if its distance from the camera is in
-    ``distance_range`` (with a tolerance of 20 %), and if the angle between the viewing ray and its
-    mean viewing direction is at most 60 degrees.
+    A landmark is visible if it meets three conditions. It projects into the image. Its distance
+    from the camera is in ``distance_range``, with a tolerance of 20 %. The angle between the
+    viewing ray and its mean viewing direction is at most 60 degrees.
 
     Args:
         T: ``(4, 4)`` pose of the camera (world to camera).

@@ -126,8 +126,8 @@ def extract_at(found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.ui
 
 @kernel
 def _is_free(pixel, existing):
-    """Return an ``(N,)`` bool mask of the ``(N, 2)`` pixels that are far from all ``(M, 2)``
-    existing features."""
+    """Return ``(N,)`` bool, True for ``(N, 2)`` pixels that are far from all ``(M, 2)`` existing
+    features."""
     free = np.ones(len(pixel), np.bool_)
     for i in range(len(pixel)):
         x, y = pixel[i, 0], pixel[i, 1]

@@ -122,10 +122,10 @@ def relocalise(
 ) -> int:
     """Find the pose of a frame at a place that looks similar, without a predicted pose.
 
-    The descriptors of the frame are matched with the landmarks of the place, and a pose is
-    estimated by P3P inside RANSAC, which needs no stereo. Then all landmarks of the surroundings
-    are searched for near their projections, first in wide windows and then in windows of the usual
-    size.
+    The descriptors of the frame are matched with the landmarks of the place. A pose is estimated
+    from the matches by P3P inside RANSAC, which needs no stereo. Then all landmarks of the
+    surroundings are searched for near their projections. The first search uses wide windows, and
+    the second search uses windows of the usual size.
 
     Args:
         frame: receives the pose and the matches. On failure, both are reset.

@@ -94,8 +94,8 @@ class RigCalibration:
         frame.disparity_offset = self.disparity_offset
 
     def mark_corrected(self, frame: Frame) -> None:
-        """Mark a frame that was restored from a checkpoint as corrected, because its columns in the
-        right image were corrected before the frame was saved."""
+        """Mark a frame that was restored from a checkpoint as corrected. It was corrected before it
+        was saved."""
         frame.disparity_offset, frame.delay_removed = self.disparity_offset, True
 
     def observe(self, frame: Frame, twist: Matrix | None) -> None:

@@ -153,7 +153,7 @@ class DelayState:
         n_group: number of frames in the group that is being filled.
         length: number of frames in a full group.
         solution: ``(1 + P,)`` the delay in seconds, followed by the P coefficients of the
-            polynomial that models a wrong calibration, as estimated when the last group became
+            polynomial that models a wrong calibration. It is estimated whenever a group becomes
             full.
         twist: ``(6,)`` velocity of the camera before the last frame, see ``Frame.twist``.
         waiting: ``(7 + P, 7 + P)`` moments of the last frame, which has not been added to a group

@@ -47,9 +47,10 @@ def match_stereo(
 ) -> StereoMatches:
     """Match each left feature with a right feature, independently of the other left features.
 
-    A right feature is a candidate if it lies in the same row as the left feature (within 2 px at
-    the scale of the right feature), if their octaves differ by at most one, and if the disparity is
-    between 0 and the disparity of a point at a distance of one baseline.
+    A right feature is a candidate if it meets three conditions. It lies in the same row as the left
+    feature, within 2 px at the scale of the right feature. The octaves of the two features differ
+    by at most one. The disparity is between 0 and the disparity of a point at a distance of one
+    baseline.
 
     The candidate with the closest descriptor is chosen. Then a window around the right feature is
     shifted along the row, at the pyramid level of the left feature. The shift with the least sum of
@@ -119,7 +120,8 @@ def rows_to_features(xy, octave, scales, height):
 @kernel
 def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, half, reach):
     """Return the ``(N,)`` float32 column of each match in the right image, and its ``(N,)`` float32
-    SAD. For features without a match, the column is NaN and the SAD is -1."""
+    sum of absolute differences (SAD). For features without a match, the column is NaN and the SAD
+    is -1."""
     xy_l, octave_l, descriptors_l, pixels_l = left
     xy_r, octave_r, descriptors_r, pixels_r = right
     n = len(xy_l)
@@ -170,7 +172,8 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
 
 def inliers_only(matches: StereoMatches, octave: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the columns of the matches in the right image, with NaN for outliers. A match is an
-    outlier if its SAD exceeds ``MEDIAN_FACTOR`` times the median SAD of all matches in its octave.
+    outlier if its sum of absolute differences (SAD) exceeds ``MEDIAN_FACTOR`` times the median SAD
+    of its octave.
 
     Args:
         octave: ``(N,)`` uint8 octave of each feature, sorted.
@@ -205,9 +208,9 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
     with a patch of the left image.
 
     Returns:
-        The shift relative to the column ``x_r``, in pixels of the pyramid level, and the SAD at
-        this shift. The shift is NaN if a patch would leave the image, or if the least SAD is at an
-        end of the search range.
+        The shift relative to the column ``x_r``, in pixels of the pyramid level, and the sum of
+        absolute differences (SAD) at this shift. The shift is NaN if a patch would leave the image,
+        or if the least SAD is at an end of the search range.
     """
     height, width = image_l.shape
     if (
@@ -235,7 +238,7 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
 
 @inner_kernel
 def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
-    """Add the SAD of two patches at each shift to ``costs``.
+    """Add the sum of absolute differences of two patches at each shift to ``costs``.
 
     A vector register holds ``LANES`` shifts. Four columns of the patch are summed before the
     register is stored. Lanes beyond the last shift may read from the next row, and the caller
@@ -287,9 +290,9 @@ def refine_shift(image_l, image_r, x_l, y_l, x_r, shift, half):
     """Find the shift, in pixels, that minimises the sum of squared differences between two patches.
     ``shift`` is a first estimate in (-1, 1).
 
-    The minimum of a parabola through three SADs is biased towards whole pixels. Two Gauss-Newton
-    steps on the interpolated patch remove this bias (Lucas and Kanade, IJCAI 1981). If these steps
-    fail, ``shift`` is returned.
+    The minimum of a parabola through three sums of absolute differences is biased towards whole
+    pixels. Two Gauss-Newton steps on the interpolated patch remove this bias (Lucas and Kanade,
+    IJCAI 1981). If these steps fail, ``shift`` is returned.
     """
     start = shift
     width = image_r.shape[1]

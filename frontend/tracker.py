@@ -140,8 +140,8 @@ class Tracker:
     def track_patches(self, frame: Frame, T_cw: Matrix, view: MapView) -> Found:
         """Track a frame using the image patches of landmarks, without extracting features.
 
-        The result is LOST if too few patches are found, or if the frame cannot be tracked in this
-        way, for example because the previous frame was not tracked.
+        The result is LOST if too few patches are found. It is also LOST if the frame cannot be
+        tracked in this way, for example because the previous frame was not tracked.
 
         Args:
             T_cw: ``(4, 4)`` predicted pose (world to camera).
@@ -278,9 +278,9 @@ class Tracker:
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
         """Find a first pose and first matches of a frame. Returns the number of inliers.
 
-        The frame is tracked against the last frame if the motion is known, then against the
-        reference keyframe, and finally against the local map at the predicted pose, until one of
-        them succeeds.
+        Three methods are tried in turn: tracking against the last frame, tracking against the
+        reference keyframe, and ``_track_predicted``. The first and the last method need a known
+        motion.
         """
         if self.last is None and self.status is not TrackerStatus.RESUMED:
             return 0
@@ -316,12 +316,12 @@ class Tracker:
         return n_inliers >= max(config.min_inliers_motion, config.min_inlier_ratio * n_matches)
 
     def _is_doubtful(self, frame: Frame, n_inliers: int, view: MapView, frames: FramePoses) -> bool:
-        """Return whether a frame is doubtful: it has few inliers, and there is another reason why
-        its matches may be wrong.
+        """Return whether a frame has few inliers and there is another reason why its matches may be
+        wrong.
 
-        There are three such reasons: a gap in time; an unknown motion, because the pose was then
-        not predicted; and a sudden drop in the number of inliers, for example after the camera was
-        carried away.
+        There are three such reasons. The first is a gap in time. The second is an unknown motion,
+        because the pose was then not predicted. The third is a sudden drop in the number of
+        inliers, for example after the camera was carried away.
         """
         if self.last is None:
             return False

@@ -86,11 +86,11 @@ def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
 def track_motion(
     frame: Frame, previous: Frame, T_cw: NDArray[np.float64], context: TrackingContext
 ) -> tuple[int, int]:
-    """Track a frame against the points of the previous frame: match the points near their
-    projections with the predicted pose, and optimise the pose.
+    """Track a frame against the points of the previous frame. The points are matched near their
+    projections with the predicted pose, and the pose is optimised.
 
-    The points are the landmarks of the previous frame and its other close stereo points, which are
-    not in the map (the visual-odometry points of ORB-SLAM2).
+    The points are the landmarks of the previous frame and its other close stereo points (the
+    visual-odometry points of ORB-SLAM2).
 
     Args:
         frame: receives the pose and the matches.
@@ -314,9 +314,10 @@ def uncertainty_of(
         offset_sigma: standard deviation of the disparity offset, pixels; 0 for cameras without one.
 
     Returns:
-        The ``(6, 6)`` covariance of the pose ``T_cw`` relative to the points that the frame tracks
-        (``pose_covariance``), and the ``(6, 3)`` effect on the motion if the disparity offset is
-        wrong by ``offset_sigma`` (``offset_effect``). The effect is None if ``offset_sigma`` is 0.
+        Two matrices. The first is the ``(6, 6)`` covariance of the pose ``T_cw`` relative to the
+        points that the frame tracks (``pose_covariance``). The second is the ``(6, 3)`` effect on
+        the motion if the disparity offset is wrong by ``offset_sigma`` (``offset_effect``). It is
+        None if ``offset_sigma`` is 0.
     """
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
     observed = _observed_points(frame, matched, context)
@@ -350,8 +351,8 @@ def _observed_points(
 def observations(
     frame: Frame, feature: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the ``(N, 3)`` float64 u, v, u_right of ``(N,)`` features of a frame, in pixels, and
-    the ``(N,)`` float64 inverse variances of u and v."""
+    """Return two arrays for ``(N,)`` features of a frame: their ``(N, 3)`` float64 u, v, u_right,
+    in pixels, and the ``(N,)`` float64 inverse variances of u and v."""
     features = frame.features
     uvr = stack_uvr(features.xy[feature], features.u_right[feature])
     return uvr, context.scales[features.octave[feature]] ** -2.0

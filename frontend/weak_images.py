@@ -94,8 +94,8 @@ def grain(image, stride, least):
 
     Returns:
         Standard deviation of the noise, in grey levels; share of the pixels that are spikes. A
-        spike is brighter than both of its neighbours, or darker than both of them, by more than
-        ``least`` grey levels and by more than four standard deviations.
+        spike is brighter than both of its neighbours, or darker than both of them. The difference
+        must exceed ``least`` grey levels and four standard deviations.
     """
     height, width = image.shape
     counts = np.zeros(1021, np.int64)
@@ -146,14 +146,14 @@ def _is_faint(image: Grey, config: WeakImageConfig) -> bool:
 
 
 def detail(image: Grey) -> float:
-    """Measure how much fine detail an image has: the mean absolute second difference of the grey
-    values along the rows, in grey levels."""
+    """Compute the mean absolute second difference of the grey values along the rows, in grey
+    levels. It measures how much fine detail an image has."""
     return float(np.abs(np.diff(image[::2].astype(np.int16), 2, axis=1)).mean())
 
 
 def contrast(image: Grey) -> float:
-    """Measure the contrast of an image, in grey levels: the median, over the blocks of the image,
-    of the standard deviation of the grey values in a block."""
+    """Compute the median standard deviation of the grey values in the blocks of an image, in grey
+    levels."""
     rows, columns = (side // _BLOCK * _BLOCK for side in image.shape)
     if not rows or not columns:
         return 0.0

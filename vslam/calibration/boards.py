@@ -340,8 +340,8 @@ def _recognised_tags(images: Sequence[Image]) -> Board | None:
 def _layout(
     kind: Kind, first: int, columns: int, family: str, numbers: NDArray[np.int64], xy: Array
 ) -> tuple[int, Board | None]:
-    """Fit a board with a given number of columns to the tags in an image, if tag 0 is in column
-    ``first`` of the first row.
+    """Fit a board with a given number of columns to the tags in an image. It is assumed that tag 0
+    is in column ``first`` of the first row.
 
     Returns:
         The number of tags that fit, and the board; 0 and None if too few tags fit.

@@ -64,8 +64,8 @@ class Document:
         return self._numbers(key, f"{wanted} numbers" if counts else "numbers", *counts)
 
     def matrix(self, key: str, rows: int, columns: int) -> Array:
-        """Return the ``(rows, columns)`` matrix that is stored under a key, as a list of rows or as
-        a flat list of the numbers row by row."""
+        """Return the ``(rows, columns)`` matrix that is stored under a key. The value may be a list
+        of rows, or a flat list of the numbers row by row."""
         found = self._numbers(key, f"{rows}x{columns} numbers", rows * columns)
         return np.array(found).reshape(rows, columns)
 

@@ -102,8 +102,9 @@ def unproject(model: CameraModel, xy: Array) -> Array:
     """Compute the viewing rays of ``(N, 2)`` pixels, as ``(N, 3)`` float64 unit vectors in the
     camera frame.
 
-    The ray of a pixel is NaN if the distortion cannot be inverted there: Newton's method does not
-    converge, or the distortion is not monotonic between the principal point and the pixel.
+    The ray of a pixel is NaN if the distortion cannot be inverted there. This happens if Newton's
+    method does not converge. It also happens if the distortion is not monotonic between the
+    principal point and the pixel.
     """
     plane = (xy - (model.cx, model.cy)) / (model.fx, model.fy)
     if model.lens == "fisheye":
@@ -165,8 +166,8 @@ def _undistorted(distortion: tuple[float, ...], wanted: Array) -> Array:
 
 
 def _bent(distortion: tuple[float, ...], angle: Array) -> Array:
-    """Return the distance from the principal point to the projection of a ray, in focal lengths,
-    for the angle between the ray and the optical axis in radians."""
+    """Return the distance from the principal point to the projection of a ray, in focal lengths.
+    ``angle`` is the angle between the ray and the optical axis, in radians."""
     k1, k2, k3, k4 = distortion
     a2 = angle * angle
     return angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))

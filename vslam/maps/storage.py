@@ -1,4 +1,4 @@
-"""Reads and writes map files, which are ``.npz`` files.
+"""Reads and writes map files. A map file is an ``.npz`` file.
 
 A map file is written atomically, and it is checked when it is read. The arrays are not compressed.
 Most of the data are descriptors, which do not compress well, and a map should load within a second.
@@ -36,15 +36,15 @@ def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) ->
     """Write a map to a file. An existing file is replaced; after an error or a power cut, it is
     unchanged.
 
-    The file contains the JSON text ``header`` and the arrays of ``ARRAYS``. The data of the loop
-    detector for each keyframe (``PerKeyframe``) are stored as ``detector_NAME_first`` and
+    The file contains the JSON text ``header`` and the arrays of ``checked_map.ARRAYS``. The data of
+    the loop detector for each keyframe (``PerKeyframe``) are stored as ``detector_NAME_first`` and
     ``detector_NAME_values``, and the images of the keyframes as ``image_first`` and
-    ``image_values``. Observations are sorted by landmark, and those of one landmark are in the
+    ``image_values``. Observations are sorted by landmark. The observations of a landmark are in the
     order of its linked list.
 
     Args:
-        resumable: if True, the checkpoint is written if there is one, and with it culled keyframes
-            and landmarks.
+        resumable: if True and the map has a checkpoint, the checkpoint is written, and culled
+            keyframes and landmarks are kept.
 
     Raises:
         OSError: the file cannot be written.

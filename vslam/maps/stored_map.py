@@ -34,8 +34,8 @@ class TruthAlignment:
     Attributes:
         name: name of the data set and the sequence of the ground truth.
         S_truth_world: ``(4, 4)`` transformation from the world frame of the map to the world frame
-            of the ground truth, which aligns the trajectory of the first drive. It is a rigid
-            motion, or a similarity for a monocular map.
+            of the ground truth. It aligns the trajectory of the first drive. It is a rigid motion,
+            or a similarity for a monocular map.
     """
 
     name: str
@@ -84,8 +84,8 @@ class StoredMap:
         are ordered by the first remaining keyframe that observes them.
 
         Args:
-            copy: if False and if all keypoints are kept, the arrays of keypoints, which make up
-                three quarters of the size of a map, are views instead of copies.
+            copy: if False and if all keypoints are kept, the arrays of keypoints are views instead
+                of copies. These arrays make up three quarters of the size of a map.
         """
         return self.select(self.map.living_keyframes(), copy=copy)
 
@@ -328,9 +328,12 @@ def near_point(map_: Map, point: Sequence[float], within: float) -> NDArray[np.i
 def near_frames(
     map_: Map, drive: int, first: float, last: float, within: float
 ) -> NDArray[np.int64]:
-    """Return the ids of the keyframes that are at most ``within`` metres from a keyframe that was
-    made from the frames ``first`` to ``last`` of a drive. The ids are in ascending order, without
-    culled keyframes."""
+    """Return the ids of the keyframes near some frames of a drive, in ascending order, without
+    culled keyframes.
+
+    A keyframe is included if it is at most ``within`` metres from a keyframe that was made from the
+    frames ``first`` to ``last``.
+    """
     from scipy.spatial import cKDTree
 
     keyframes, xz = _places(map_)

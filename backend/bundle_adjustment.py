@@ -50,7 +50,7 @@ class BundleProblem:
     disparity_weight: NDArray[np.float64] | None = None
 
     def disparity_weights(self) -> NDArray[np.float64]:
-        """Return ``disparity_weight``, or ``(O,)`` times the ratio in ``intrinsics`` if it is
+        """Return ``(O,)`` float64: ``disparity_weight``, or the ratio in ``intrinsics`` if it is
         None."""
         if self.disparity_weight is not None:
             return self.disparity_weight

@@ -90,7 +90,6 @@ class Positions:
     sigma: Array
 
     def select(self, chosen: NDArray[np.bool_]) -> Positions:
-        """Return the positions for which the ``(M,)`` bool array ``chosen`` is True."""
         return Positions(*(values[chosen] for values in vars(self).values()))
 
     @property
@@ -373,8 +372,6 @@ def _log_determinant(factors: Any, values: Any) -> float:
 
 
 def _optimised(factors: _Factors, config: PoseGraphConfig) -> Array:
-    """Find the ``(N, 4, 4)`` poses of the keyframes that agree best with the edges and the
-    fixes."""
     factors.vision.push_back(factors.fixes)
     return _poses(minimised(factors.vision, factors.start, config))
 

@@ -84,7 +84,6 @@ def triangulate_with_neighbours(
 
 
 def median_depth(map_: Map, keyframe: int) -> float:
-    """Return the median depth of the landmarks that a keyframe observes."""
     points, T_cw = map_.arrays.xyz[map_.landmarks_of(keyframe)], map_.arrays.T_cw[keyframe]
     return float(np.median(points @ T_cw[2, :3] + T_cw[2, 3]))
 
@@ -334,8 +333,7 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
     ``point``, ``(3,)``.
 
     Usually, the two viewing rays are intersected. If the stereo pair of one keyframe sees the
-    landmark with more parallax than the two rays have, the stereo point of that keyframe is used
-    instead.
+    landmark with more parallax than the two rays have, its stereo point is used instead.
 
     Args:
         depth_1, depth_2: stereo depths of the features; NaN for a feature without stereo depth.

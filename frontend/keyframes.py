@@ -242,11 +242,9 @@ class KeyframePolicy:
         return True
 
     def keyframe_made(self) -> None:
-        """Update the state after a frame became a keyframe."""
         self._state = replace(self._state, gain_awaited=True, due=-1)
 
     def state(self) -> PolicyState:
-        """Return the state for a map file or a checkpoint."""
         return self._state
 
     def restore(self, state: PolicyState) -> None:

@@ -157,8 +157,7 @@ def _mixed(A, B):
 
 @inner_kernel
 def _real_root(c3, c2, c1, c0):
-    """Compute a real root of ``c3 x^3 + c2 x^2 + c1 x + c0`` in closed form, and refine it by
-    Newton's method."""
+    """Compute a real root of ``c3 x^3 + c2 x^2 + c1 x + c0``."""
     b, c, d = c2 / c3, c1 / c3, c0 / c3
     shift = b / 3.0
     p = c - b * b / 3.0
@@ -187,8 +186,8 @@ def _real_root(c3, c2, c1, c0):
 
 @inner_kernel
 def _refine_depths(depth, a12, a13, a23, b12, b13, b23):
-    """Refine the depths of the three points by Newton's method on the law of cosines for each pair
-    of points (section 3.6 of the Lambda Twist paper)."""
+    """Refine the depths of the three points by Newton's method (section 3.6 of the Lambda Twist
+    paper). The equations are the law of cosines for each pair of points."""
     for _ in range(5):
         l1, l2, l3 = depth[0], depth[1], depth[2]
         r1 = l1 * l1 + l2 * l2 - 2.0 * b12 * l1 * l2 - a12

@@ -92,8 +92,6 @@ class Relocaliser:
         return found
 
     def _find(self, frame: Frame, map_: Map) -> Found:
-        """Relocalise a frame at keyframes that look similar, first with ORB descriptors and then
-        with ``recognise``."""
         config = self._context.config.relocalization
         candidates = self._locate(frame.image, frame.features, map_)
         for candidate in candidates[: config.max_candidates]:

@@ -272,7 +272,7 @@ class SideDelay:
     def restore(self, state: DelayState) -> None:
         self.seconds, self.sigma = 0.0, np.inf
         self._state = deepcopy(state)
-        self._solve()
+        self._estimate()
 
     def _moments(
         self,
@@ -319,10 +319,9 @@ class SideDelay:
             if len(state.groups) == MOST_GROUPS:  # merge neighbours in pairs
                 state.groups = state.groups[::2] + state.groups[1::2]
                 state.length *= 2
-            self._solve()
+            self._estimate()
 
-    def _solve(self) -> None:
-        """Estimate the delay and its standard deviation from all full groups."""
+    def _estimate(self) -> None:
         groups = self._state.groups
         if len(groups) < FEWEST_GROUPS:
             return

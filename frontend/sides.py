@@ -63,7 +63,6 @@ class ComparedSides:
     darker_stops: list[float] = field(default_factory=list)
 
     def add(self, sides: Sides) -> None:
-        """Add one stereo pair to the summary."""
         self.n += 1
         self.n_black_left += sides.black == "left"
         self.n_black_right += sides.black == "right"

@@ -85,7 +85,6 @@ class Found:
 
 
 def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingState:
-    """Return the tracking state of a frame with the given numbers of matches and inliers."""
     config = context.config.tracking
     # The search windows of an RGB-D camera are wide, so that even a wrong pose has some inliers.
     share = config.depth_min_inlier_ratio if context.camera.depth else 0.0
@@ -224,7 +223,6 @@ class Tracker:
         self.last, self.lost_frames, self.status = frame, 0, TrackerStatus.TRACKING
 
     def lose(self) -> None:
-        """Count a frame as lost."""
         self.lost_frames += 1
         self.status = TrackerStatus.LOST
 
@@ -342,8 +340,6 @@ def result_of(
     stage_ms: dict[str, float],
     odometry: Odometry,
 ) -> TrackResult:
-    """Create the ``TrackResult`` of a frame. ``stage_ms`` is the time that each stage took, in
-    milliseconds."""
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,

@@ -71,7 +71,6 @@ def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 
 def _right_delay(document: Document) -> float:
-    """Read the delay of the right image after the left image in seconds; 0 if it is missing."""
     if "right_delay" not in document:
         return 0.0
     delay = document.number("right_delay")

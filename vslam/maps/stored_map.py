@@ -289,8 +289,7 @@ def _spanning_tree(
 
 
 def _renumbered(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> FrameTable:
-    """Convert the poses of frames so that they are relative to keyframes that were not culled, with
-    the new ids of these keyframes."""
+    """Convert the poses of frames so that they are relative to keyframes that were not culled."""
     reference = frames.reference.copy()
     T_c_reference, unit = frames.T_c_reference.copy(), frames.unit_scale.copy()
     table = map_.keyframes

@@ -112,8 +112,8 @@ class Anchored:
         used: ``(M,)`` bool, True for GPS fixes that passed the chi-square test.
         residual_m: root mean square distance of the used fixes from the trajectory.
         S_enu_w: ``(4, 4)`` alignment of the whole map before the optimisation.
-        level: whether the fixes determine the rotation of the map about every axis. If the fixes
-            lie on a straight line, they do not. The rotation about the line then follows from the
+        level: whether the fixes determine the rotation of the map about every axis. It is False if
+            the fixes lie on a straight line. The rotation about the line is then determined by the
             assumption that the camera is upright.
     """
 

@@ -306,7 +306,7 @@ def motions_of_essential(E: Matrix) -> list[Matrix]:
 def motions_of_homography(A: Matrix) -> list[Matrix]:
     """Return the eight candidate motions ``T_2_1`` of a calibrated homography (Faugeras and
     Lustman, "Motion and structure from motion in a piecewise planar environment", 1988). The list
-    is empty for a pure rotation."""
+    is empty if two singular values are equal, for example for a pure rotation."""
     U, (d1, d2, d3), Vt = np.linalg.svd(A)
     if d1 / d2 < 1.00001 or d2 / d3 < 1.00001:
         return []

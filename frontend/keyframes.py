@@ -194,8 +194,8 @@ class KeyframePolicy:
         )
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:
-        """Return whether the frame should become a keyframe. Whether the place is already mapped is
-        not tested here, but in ``is_known``."""
+        """Return whether the frame should become a keyframe. The method ``is_known`` tests whether
+        the place is already mapped."""
         camera = self._context.camera
         if camera.monocular:
             return needs_monocular_keyframe(evidence, self._config)

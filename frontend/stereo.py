@@ -74,7 +74,8 @@ class _Side(NamedTuple):
     """One image of a stereo pair, as an argument of kernels: N features, and the pixels of its
     pyramid.
 
-    ``xy`` has shape ``(N, 2)``, ``octave`` ``(N,)``, and ``descriptor`` ``(N, 4)``.
+    Attributes:
+        xy, octave, descriptor: ``(N, 2)``, ``(N,)`` and ``(N, 4)``.
     """
 
     xy: NDArray[np.float32]

@@ -27,7 +27,7 @@ from vslam.states import TrackerState
 
 
 class TrackerStatus(Enum):
-    """Whether the last frame was tracked, and from where the next frame can be tracked."""
+    """The state of the tracker between two frames."""
 
     UNKNOWN = "unknown"
     """No frame has been tracked in this map. The camera may be anywhere in it."""
@@ -64,10 +64,8 @@ class Found:
 
     @classmethod
     def at_start(cls, frame: Frame, *, begun: bool) -> Found:
-        """Create the result for a frame that was not tracked because no map existed yet.
-
-        The state is OK if the frame has started a map (``begun``), and LOST otherwise.
-        """
+        """Create the result for a frame before a map exists. The state is OK if the frame has
+        started a map (``begun``), and LOST otherwise."""
         n_landmarks = int(np.count_nonzero(frame.landmark >= 0))
         state = TrackingState.OK if begun else TrackingState.LOST
         return cls(state, n_landmarks, n_landmarks)

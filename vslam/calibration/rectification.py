@@ -242,8 +242,8 @@ def _maps(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray
 
 
 def _linear(maps: NDArray[np.float32]) -> Callable[[Image], Image]:
-    """Make a function that warps an image bilinearly, with a resolution of 1/32 pixel. Fixed-point
-    numbers are three times as fast as floating point."""
+    """Make a function that warps an image bilinearly, with a resolution of 1/32 pixel. The
+    fixed-point maps are three times as fast as floating-point maps."""
     import cv2
 
     fixed, weights = cv2.convertMaps(maps[..., 0], maps[..., 1], cv2.CV_16SC2)

@@ -14,8 +14,8 @@ from vslam.errors import InputError, ResultsError
 
 @contextmanager
 def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
-    """Yield the path of a temporary file or folder for the output. It is renamed to ``path`` if the
-    block succeeds, and removed if the block raises an exception.
+    """Yield the path of a temporary file or folder for the output. The temporary file or folder is
+    renamed to ``path`` if the block succeeds, and removed if the block raises an exception.
 
     Raises:
         InputError: ``path`` exists already. If a folder is written, an existing empty folder is
@@ -44,8 +44,8 @@ def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[BinaryIO]:
-    """Yield a temporary file, open for writing, which replaces ``path`` atomically at the end. It
-    is first synced to the disk. After an error, ``path`` is unchanged.
+    """Yield a temporary file, open for writing. At the end, the file is synced to the disk and
+    replaces ``path`` atomically. After an error, ``path`` is unchanged.
 
     Raises:
         OSError: the file cannot be written, for example because the disk is full.

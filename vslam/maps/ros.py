@@ -98,9 +98,11 @@ def in_ros_axes(T: Matrix) -> Matrix:
 
 
 def odometry_message(types: Types, pose: FramePose, before: FramePose | None) -> Any:
-    """Create ``nav_msgs/Odometry`` with the pose of ``base_link`` in the frame ``odom``, and its
-    velocity in the axes of ``base_link``. It is the mean velocity since the earlier frame
-    ``before``, or zero if ``before`` is None."""
+    """Create ``nav_msgs/Odometry`` with the pose of ``base_link`` in the frame ``odom``.
+
+    The velocity is in the axes of ``base_link``. It is the mean velocity since the earlier frame
+    ``before``, or zero if ``before`` is None.
+    """
     twist, R = np.zeros(6), T_BASE_OPTICAL[:3, :3]
     if before is not None:
         motion = inverse(before.T_odom_base) @ pose.T_odom_base

@@ -33,12 +33,12 @@ _FOREIGN = "not a map of vslam; give a map.npz or the folder of a run"
 
 
 def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) -> None:
-    """Write a map to a file. An existing file is replaced; after an error or a power cut, it is
+    """Write a map to a file. An existing file is replaced. After an error or a power cut, it is
     unchanged.
 
     The file contains the JSON text ``header`` and the arrays of ``checked_map.ARRAYS``. The data of
     the loop detector for each keyframe (``PerKeyframe``) are stored as ``detector_NAME_first`` and
-    ``detector_NAME_values``, and the images of the keyframes as ``image_first`` and
+    ``detector_NAME_values``. The images of the keyframes are stored as ``image_first`` and
     ``image_values``. Observations are sorted by landmark. The observations of a landmark are in the
     order of its linked list.
 

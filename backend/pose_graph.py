@@ -243,8 +243,8 @@ def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
 
 
 def load_optimiser() -> None:
-    """Import GTSAM, which takes a tenth of a second. During the first loop closure, frames of a
-    live camera would have to wait for the import."""
+    """Import GTSAM in advance. The import takes a tenth of a second, which would delay the frames
+    of a live camera during the first loop closure."""
     import gtsam  # noqa: F401
 
 
@@ -324,13 +324,13 @@ def check_pose_graph(
     """Test whether an optimised graph is plausible. If it is not, the new loop is wrong and must be
     rejected.
 
-    There are two tests. First, a loop edge whose residual is still large contradicts the other
-    loops, or a large part of the path.
+    The first test checks the residual of each loop edge. A loop edge whose residual is still large
+    contradicts the other loops, or a large part of the path.
 
-    Second, the strain, which is the total chi-square of the tree, covisibility and gap edges, must
-    not be much larger than its expected value. If the drift follows the model, the strain has six
-    degrees of freedom per closed loop. If it is several times larger, no plausible drift explains
-    the loop. A single loop across a WEAK edge always passes, because it causes no strain.
+    The second test checks the strain: the total chi-square of the tree, covisibility and gap edges.
+    If the drift follows the model, the strain has six degrees of freedom per closed loop. If the
+    strain is several times larger, no plausible drift explains the loop. A single loop across a
+    WEAK edge always passes the tests, because it causes no strain.
 
     Args:
         T_cw: ``(N, 4, 4)`` poses that ``optimise`` returned.
@@ -367,8 +367,8 @@ def check_edge_errors(
 
 @kernel
 def edge_errors(T_cw, edges, T_i_j, sigmas):
-    """Compute the ``(E,)`` chi-square of each edge: the squared norm of the twist of its residual
-    motion, divided by the standard deviations."""
+    """Compute the ``(E,)`` chi-square of each edge. The residual motion is expressed as a twist,
+    whose components are divided by the standard deviations."""
     chi2 = np.empty(len(edges))
     for e in range(len(edges)):
         T = compose(T_cw[edges[e, 0]], inverse(T_cw[edges[e, 1]]))

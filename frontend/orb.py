@@ -346,7 +346,7 @@ def smoothed(pixels):
     """Blur an ``(H, W)`` uint8 image of at least 4x4 pixels, for BRIEF. The result is identical to
     that of ``cv2.GaussianBlur`` with a 7x7 kernel and a sigma of 2.
 
-    OpenCV's weights are multiples of 1/256, and it rounds once at the end. Here, row sums are split
+    OpenCV uses weights in multiples of 1/256, and rounds once at the end. Here, row sums are split
     into whole grey levels and 256ths. Every intermediate sum then fits into 16 bits, so a vector
     register holds twice as many pixels as with 32 bits.
     """

@@ -213,8 +213,8 @@ def _refine_depths(depth, a12, a13, a23, b12, b13, b23):
 
 @inner_kernel
 def _pose_of_triangle(points, rays, depth, T):
-    """Write the pose (world to camera) that maps three points to the given depths along their rays
-    into ``T``."""
+    """Write into ``T`` the pose (world to camera) that maps three points to the given depths along
+    their rays."""
     placed = np.empty((3, 3))
     for i in range(3):
         for k in range(3):
@@ -238,7 +238,7 @@ def _pose_of_triangle(points, rays, depth, T):
 @inner_kernel
 def _triad(points, axes):
     """Write an orthonormal frame of a triangle into the rows of ``axes``: the direction of the
-    first side, the normal, and their cross product."""
+    first side, the normal of the triangle, and the cross product of both."""
     _cross(points, axes[1])
     for k in range(3):
         axes[0, k] = points[1, k] - points[0, k]

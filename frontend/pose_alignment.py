@@ -188,9 +188,9 @@ def _corner(point, intrinsics, ratio_x, ratio_y):
 
 @inner_kernel
 def _draw_template(before, point, intrinsics, ratio_x, ratio_y, template, jacobian):
-    """Write the grey values of the window around a projected point into ``template``, and their
-    derivatives with respect to the motion into ``jacobian``. The mean over the window is subtracted
-    from both. Returns False if the window is not inside the image."""
+    """Read the window around a projected point. The grey values are written into ``template``, and
+    their derivatives with respect to the motion into ``jacobian``. The mean over the window is
+    subtracted from both. Returns False if the window is not inside the image."""
     height, width = before.shape
     x, y, z = point[0], point[1], point[2]
     if not z > 0.1:
@@ -235,8 +235,8 @@ def _draw_template(before, point, intrinsics, ratio_x, ratio_y, template, jacobi
 
 @inner_kernel
 def _read_window(image, T, p, intrinsics, ratio_x, ratio_y, seen):
-    """Move a point by ``T``, and write the grey values of the window around its projection, minus
-    their mean, into ``seen``. Returns False if the window is not inside the image."""
+    """Move a point by ``T``, and read the window around its projection. The grey values minus their
+    mean are written into ``seen``. Returns False if the window is not inside the image."""
     height, width = image.shape
     x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
     y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]

@@ -113,7 +113,10 @@ class RigCalibration:
         return RigState(self.delay.state().numbers(), self.sides.numbers())
 
     def restore(self, state: RigState) -> None:
-        """Raises:
-        ValueError: the stored state is damaged."""
+        """Restore the measurements that ``state`` returned.
+
+        Raises:
+            ValueError: the stored state is damaged.
+        """
         self.delay.restore(DelayState.of_numbers(state.delay))
         self.sides = ComparedSides.of_numbers(state.sides)

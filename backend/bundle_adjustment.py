@@ -95,7 +95,6 @@ class BundleSolution:
         points: ``(P, 3)`` landmarks in the world frame.
         cost: half the sum of the Huber losses.
         inlier: ``(O,)`` bool, True for observations that pass the chi-square test.
-        iterations: number of iterations that were run.
     """
 
     T_cw: NDArray[np.float64]
@@ -115,7 +114,6 @@ def adjust(
     """Minimise the robust reprojection error by Levenberg-Marquardt.
 
     Args:
-        iterations: maximum number of iterations.
         use: ``(O,)`` bool mask of the observations that are used; None uses all.
         tolerance: the optimisation stops when an iteration reduces the cost by a smaller fraction
             than this.

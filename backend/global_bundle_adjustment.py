@@ -40,7 +40,6 @@ def adjust_globally(
 
     Args:
         problem: a keyframe must not observe a landmark more than once.
-        iterations: maximum number of Levenberg-Marquardt iterations.
         tolerance: the optimisation stops when an iteration reduces the cost by a smaller fraction
             than this.
         stop: called before each iteration. If it returns True, the current estimate is returned.

@@ -26,7 +26,6 @@ class GlobalSnapshot:
     """A copy of the map as a bundle problem, with the ids of its cameras, points and observations.
 
     Attributes:
-        problem: the bundle problem.
         keyframes: ``(K,)`` int64 keyframe id of each camera of the problem.
         landmarks: ``(P,)`` int32 landmark id of each point of the problem.
         rows: ``(O,)`` int64 row of each observation in the observation arrays of the map.

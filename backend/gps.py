@@ -132,7 +132,6 @@ def anchor(
     with the essential graph and the GPS fixes.
 
     Args:
-        graph: the essential graph of the map.
         seconds: ``(N,)`` times of the keyframes.
         metric: whether the unit of the map is the metre, apart from errors of the calibration. For
             a monocular map, it must be False. The scale and its drift are then estimated without a
@@ -209,7 +208,6 @@ def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> 
         T_wk: ``(N, 4, 4)`` poses of the keyframes in the map (camera to world).
         positions: at least three GPS positions.
         metric: see ``anchor``.
-        seed: seed of the random samples.
     """
     k, enu = positions.keyframe, positions.enu
     path = _points(T_wk[k], positions.arm)

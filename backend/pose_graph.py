@@ -204,7 +204,6 @@ def edge_sigmas(
 
     Args:
         seconds: ``(E, 2)`` timestamps of the ends of the edges.
-        n: number of keyframes.
     """
     length = np.maximum(np.linalg.norm(T_i_j[:, :3, 3], axis=1), config.min_length)
     tree, path = kind == TREE, (kind == TREE) | (kind == COVISIBLE)

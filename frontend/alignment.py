@@ -91,7 +91,6 @@ def find_patches(
     """Find the image patches of N landmarks near their expected positions in an image.
 
     Args:
-        pyramid: the pyramid of the image.
         xy: ``(N, 2)`` expected positions, full-resolution pixels.
         octave: ``(N,)`` pyramid levels in which the patches are searched for.
         T_cw: ``(4, 4)`` pose of the camera that took the image (world to camera).
@@ -180,7 +179,6 @@ def align(seen, reference, centre, which, warp, iterations, max_shift, min_corre
             relative to the middle of the patch.
         which: ``(N,)`` index of the reference patch for each patch of the frame.
         warp: ``(N, 2, 2)`` float32 matrices, see ``warps``.
-        iterations: maximum number of Gauss-Newton steps.
         max_shift: largest accepted shift in x and in y, in pixels of the frame's patch.
         min_correlation: least normalised cross-correlation of an accepted alignment.
 

@@ -115,7 +115,6 @@ def reconstruct(
     Args:
         xy_1, xy_2: ``(N, 2)`` matched pixels.
         sigma: ``(N,)`` standard deviation of these positions, pixels.
-        seed: seed of the random samples.
     """
     if len(xy_1) < SAMPLE:
         return None
@@ -155,7 +154,6 @@ def select_model(
     Args:
         xy_1, xy_2: ``(N, 2)`` matched pixels, N at least 8.
         sigma: ``(N,)`` standard deviation of these positions, pixels.
-        seed: seed of the random samples.
     """
     n = len(xy_1)
     x_1, N_1 = normalised(xy_1)

@@ -62,7 +62,6 @@ def track_patches(
     pose.
 
     Args:
-        pyramid: the pyramid of the image.
         T_cw: ``(4, 4)`` initial pose (world to camera). Its error may shift projected landmarks by
             about two pixels.
         mask: the mask of the image; None uses all pixels.

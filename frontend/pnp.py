@@ -296,7 +296,6 @@ def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         seed: uint64 seed of the random samples.
         min_inliers: least number of inliers of an acceptable pose.
-        max_draws: maximum number of samples.
         confidence: sampling ends when a better pose with at least ``min_inliers`` inliers would
             have been found with this probability.
 

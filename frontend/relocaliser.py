@@ -129,7 +129,6 @@ def relocalise(
         frame: receives the pose and the matches. On failure, both are reset.
         place: the landmarks of a candidate keyframe.
         surroundings: the landmarks of the candidate and its covisible keyframes.
-        seed: seed of the random samples.
 
     Returns:
         Number of inliers, or 0 if the pose was not found. A pose is accepted if it has at least

@@ -52,7 +52,6 @@ class ComparedSides:
     """A summary of the differences in exposure of all stereo pairs of a drive.
 
     Attributes:
-        n: number of stereo pairs that were compared.
         n_black_left, n_black_right: number of stereo pairs whose left or right image was black.
         darker_stops: all values of ``Sides.darker_stops`` that are not 0.
     """

@@ -187,7 +187,6 @@ class Tracker:
 
         Args:
             T_cw: ``(4, 4)`` predicted pose (world to camera).
-            frames: poses of all earlier frames.
         """
         n_inliers = self._track_previous_frame(frame, T_cw, view)
         if n_inliers < self._config.tracking.min_inliers_frame:
@@ -205,9 +204,6 @@ class Tracker:
 
         The twist of the frame is computed from the motion since the last tracked frame. A
         relocalised frame gets no twist, because the jump to its pose is not a motion of the camera.
-
-        Args:
-            frames: poses of all earlier frames.
         """
         if not found.relocalised:
             last = -1 if self.last is None else self.last.index

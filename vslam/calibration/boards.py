@@ -113,7 +113,6 @@ class View:
     """The corners of a board that are visible in one image.
 
     Attributes:
-        name: name of the image, for messages.
         ids: ``(N,)`` int64 numbers of the corners, which are rows of `board_points`.
         xy: ``(N, 2)`` float64 positions of the corners in pixels.
     """

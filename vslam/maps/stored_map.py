@@ -49,7 +49,6 @@ class StoredMap:
     Attributes:
         map: keyframes, landmarks and observations. Culled entries have been removed, except in a
             map with a checkpoint.
-        camera: camera of all keyframes.
         loops: closed loops, without features and landmarks. Their translations are in the current
             unit of the map.
         detector: data that the loop detector has stored about the keyframes.

@@ -88,9 +88,9 @@ def essential_graph(
     the new loop changes the map.
 
     The measurements of tree and covisibility edges are taken from the poses in the map. If
-    landmarks of the new loop were already fused, keyframes on both sides of the loop would be
-    covisible. The edges between them would then preserve the drift. Therefore, correct the map and
-    fuse landmarks only after the graph has been found to be consistent.
+    landmarks of the new loop were already fused, there would be edges across the loop that preserve
+    the drift. Therefore, correct the map and fuse landmarks only after the graph has been found to
+    be consistent.
 
     A loop edge replaces any other edge between its two keyframes. A culled keyframe of a loop is
     replaced by the keyframe that its pose is stored relative to. If several loops then connect the
@@ -102,9 +102,8 @@ def essential_graph(
 
     Args:
         loops: all closed loops, with the new loop at the end. Each loop must have a pose.
-        driven: whether the camera is on a vehicle. The motion of a vehicle during a gap can be
-            predicted roughly, so a GAP edge has some weight. Any other camera may have been carried
-            anywhere, so a WEAK edge has almost no weight.
+        driven: whether the camera is on a vehicle, whose motion during a gap can be predicted
+            roughly. Any other camera may have been carried anywhere.
 
     Raises:
         ValueError: a loop has no pose.

@@ -61,24 +61,20 @@ def needs_keyframe(
 ) -> bool:
     """Return whether a stereo or RGB-D frame should become a keyframe.
 
-    A keyframe is needed if the last keyframe is old. A keyframe is also needed if the view has
-    changed enough, or if too few close points are tracked. For these last two reasons, a keyframe
-    is made only if local mapping is idle or the need is urgent.
+    There are three reasons: the last keyframe is old, the view has changed enough, or too few close
+    points are tracked. For the last two reasons, a keyframe is made only if local mapping is idle
+    or the need is urgent.
 
-    A lack of close points is a reason for a keyframe only if a new keyframe would provide more
-    close points. On a motorway, close points are scarce and leave the view before they are seen
-    twice. Even the first frame after a keyframe then tracks too few close points. In that case, a
-    lower threshold applies: a fraction of the number of close points that such a first frame tracks
-    on average (``gained_close``).
-
-    The lower threshold applies only if enough far points constrain the pose. In fog there are no
-    far points, so the usual threshold remains.
+    A lack of close points counts only if a new keyframe would provide more of them. On a motorway,
+    even the first frame after a keyframe tracks too few close points. In that case, a lower
+    threshold applies: a fraction of the number that such a first frame tracks on average
+    (``gained_close``). The lower threshold applies only if enough far points constrain the pose. In
+    fog, there are no far points.
 
     Args:
-        depth: whether the camera is RGB-D. The maximum time between keyframes is then shorter. An
-            RGB-D camera maps nearly all points at once, because they are close, so the counts alone
-            would lead to too few keyframes. In addition, a hand-held camera turns faster than a
-            car.
+        depth: whether the camera is RGB-D. The maximum time between keyframes is then shorter,
+            because the counts alone would lead to too few keyframes: nearly all points are close
+            and are mapped at once.
     """
     max_interval_s = config.depth_max_interval_s if depth else config.max_interval_s
     required: float = config.min_tracked_close

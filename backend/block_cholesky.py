@@ -1,14 +1,12 @@
 """Sparse Cholesky factorisation of symmetric systems with one row of 6x6 blocks per keyframe.
 
-The structure of the matrix is analysed once for all iterations of an optimiser. The analysis
-computes a minimum degree elimination order (George and Liu, "The evolution of the minimum degree
-ordering algorithm", SIAM Review 1989) and the fill-in. The elimination is simulated on bit sets, so
-that the degrees are exact. This is feasible for a few thousand keyframes. The neighbours that a
-keyframe still has when it is eliminated give the nonzero blocks of its column in the factor.
+The structure of the matrix is analysed once for all iterations of an optimiser. The analysis finds
+a minimum degree elimination order (George and Liu, "The evolution of the minimum degree ordering
+algorithm", SIAM Review 1989). It also finds the fill-in. The elimination is simulated on bit sets,
+which is feasible for a few thousand keyframes.
 
 The numeric factorisation is left-looking (Davis, "Direct Methods for Sparse Linear Systems",
-section 4.8) and works on blocks. The result is deterministic: the same input produces
-byte-identical output on every run.
+section 4.8) and works on blocks. The same input produces byte-identical output on every run.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ class Structure(NamedTuple):
         row_first: ``(n + 1,)`` int64; the blocks of row r to the left of the diagonal are
             ``row_slot[row_first[r]:row_first[r + 1]]``.
         row_slot, row_column: ``(slots - n,)`` int32 slot and ``(slots - n,)`` int32 column of each
-            block below the diagonal. The blocks are sorted by row, then by column.
+            block below the diagonal, sorted by row, then by column.
     """
 
     order: NDArray[np.int64]
@@ -50,9 +48,8 @@ class Structure(NamedTuple):
 
 
 def analyse(n: int, pairs: NDArray[np.int64]) -> Structure:
-    """Compute the elimination order and the fill-in of a sparse system of ``n`` block rows.
-
-    The function takes ``n * n / 8`` bytes of temporary memory.
+    """Compute the elimination order and the fill-in of a sparse system of ``n`` block rows. This
+    takes ``n * n / 8`` bytes of temporary memory.
 
     Args:
         pairs: ``(M, 2)`` pairs of block rows that are coupled, in any order; repetitions are
@@ -137,8 +134,8 @@ def panel(structure, column):
     panel.
 
     A panel holds the transposed blocks of one column side by side. Element (i, j) of the k-th block
-    is ``S[begin + j * width + 6 * k + i]``. In this layout, the rows of a panel are long, so that
-    vector instructions are efficient.
+    is ``S[begin + j * width + 6 * k + i]``. The rows of a panel are long, so that vector
+    instructions are efficient.
     """
     first = structure.first[column]
     return BLOCK * BLOCK * first, BLOCK * (structure.first[column + 1] - first)
@@ -151,9 +148,9 @@ def factor_solve(structure, S, x):
 
     Args:
         structure: the ``Structure`` of S.
-        S: ``(36 * slots,)`` float64, the lower triangle of the matrix in elimination order, with
-            one panel per column (see ``panel``). The blocks of the fill-in must be zero. Only the
-            lower triangle of diagonal blocks is read. S is overwritten with the factor.
+        S: ``(36 * slots,)`` float64 lower triangle of the matrix in elimination order, one panel
+            per column (see ``panel``). The blocks of the fill-in must be zero. S is overwritten
+            with the factor.
         x: ``(n, 6)`` float64 right-hand side in elimination order. It is overwritten with the
             solution.
     """
@@ -209,8 +206,8 @@ def factor_solve(structure, S, x):
 
 @inner_kernel
 def add_product(S, start, pivot, end, row, place, update):
-    """Add the contribution of an earlier column of the factor to ``update``. The caller subtracts
-    ``update`` from the current column. The slots of the earlier column are ``start:end``.
+    """Add the contribution of an earlier column of the factor, with the slots ``start:end``, to
+    ``update``. The caller subtracts ``update`` from the current column.
 
     ``pivot`` is the slot of the earlier column whose row equals the index of the current column.
     Blocks that are adjacent in both columns are multiplied together, because long rows fill vector

@@ -21,13 +21,13 @@ from vslam.reprojection import chi_square, residual, unpacked
 
 @dataclass(frozen=True)
 class BundleProblem:
-    """The input of bundle adjustment: K cameras, P landmarks, and O observations. The observations
-    are sorted by landmark.
+    """The input of bundle adjustment: K cameras, P landmarks, and O observations, sorted by
+    landmark.
 
     Attributes:
         T_cw: ``(K, 4, 4)`` poses of the cameras (world to camera).
-        n_free: number of cameras that are optimised. These cameras come first in ``T_cw``. All
-            other cameras are held fixed.
+        n_free: number of cameras that are optimised. They come first in ``T_cw``. All other cameras
+            are held fixed.
         points: ``(P, 3)`` landmarks in the world frame.
         first: ``(P + 1,)`` int64; the observations of point p are ``first[p]:first[p + 1]``.
         camera: ``(O,)`` int64, index of the camera of each observation.
@@ -36,8 +36,7 @@ class BundleProblem:
         inverse_sigma2: ``(O,)`` float64, inverse variance of u and v.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         disparity_weight: ``(O,)`` float64, ratio of the standard deviation of u and v to the
-            standard deviation of the disparity; None uses the ratio in ``intrinsics`` for all
-            observations.
+            standard deviation of the disparity; None uses the ratio in ``intrinsics``.
     """
 
     T_cw: NDArray[np.float64]
@@ -51,8 +50,8 @@ class BundleProblem:
     disparity_weight: NDArray[np.float64] | None = None
 
     def disparity_weights(self) -> NDArray[np.float64]:
-        """Return ``disparity_weight``, or the ratio in ``intrinsics`` for all observations if
-        ``disparity_weight`` is None. The result is ``(O,)`` float64."""
+        """Return ``(O,)`` float64: ``disparity_weight``, or the ratio in ``intrinsics`` if it is
+        None."""
         if self.disparity_weight is not None:
             return self.disparity_weight
         return np.full(len(self.camera), self.intrinsics[5])
@@ -96,7 +95,6 @@ class BundleSolution:
         points: ``(P, 3)`` landmarks in the world frame.
         cost: half the sum of the Huber losses.
         inlier: ``(O,)`` bool, True for observations that pass the chi-square test.
-        iterations: number of iterations that were run.
     """
 
     T_cw: NDArray[np.float64]
@@ -113,11 +111,10 @@ def adjust(
     use: NDArray[np.bool_] | None = None,
     tolerance: float = 1e-6,
 ) -> BundleSolution:
-    """Run bundle adjustment: minimise the robust reprojection error by Levenberg-Marquardt.
+    """Minimise the robust reprojection error by Levenberg-Marquardt.
 
     Args:
-        iterations: maximum number of iterations.
-        use: ``(O,)`` bool, whether each observation is used; None uses all.
+        use: ``(O,)`` bool mask of the observations that are used; None uses all.
         tolerance: the optimisation stops when an iteration reduces the cost by a smaller fraction
             than this.
     """
@@ -135,8 +132,7 @@ def adjust(
 
 def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Observations:
     """Convert the observations of a bundle problem to the form in which kernels take them. ``use``
-    is an ``(O,)`` bool mask of the observations that are used; None uses all observations.
-    """
+    is an ``(O,)`` bool mask of the observations that are used; None uses all."""
     return Observations(
         problem.first,
         problem.camera,
@@ -150,8 +146,7 @@ def observations_of(problem: BundleProblem, use: NDArray[np.bool_] | None) -> Ob
 
 def empty_equations(n_free: int, n_points: int, n_observations: int) -> NormalEquations:
     """Allocate arrays for the normal equations. The array W is filled with 0, because its blocks
-    for fixed cameras and unused observations are never written.
-    """
+    for fixed cameras and unused observations are never written."""
     return NormalEquations(
         np.zeros((n_observations, 3, 6)),
         np.empty((n_points, 3, 3)),
@@ -169,8 +164,8 @@ def _in_camera(T, p, q):
 
 @kernel
 def robust_cost(T_cw, points, observations, inlier):
-    """Compute half the sum of the Huber losses. The function also writes into ``inlier`` whether
-    each observation passes the chi-square test."""
+    """Compute half the sum of the Huber losses, and write into ``inlier`` whether each observation
+    passes the chi-square test."""
     first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     cost = 0.0
@@ -230,8 +225,7 @@ def _adjust(T_start, n_free, points_start, observations, equations, iterations, 
 
 @kernel
 def linearise(T_cw, n_free, points, observations, equations):
-    """Linearise the reprojection errors at the current estimate, and write the normal equations
-    into ``equations``."""
+    """Linearise the reprojection errors, and write the normal equations into ``equations``."""
     first, camera, uvr, inverse_sigma2, disparity_weight, used, intrinsics = observations
     W, V, g, U, b = equations
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
@@ -302,9 +296,11 @@ def linearise(T_cw, n_free, points, observations, equations):
 
 @inner_kernel
 def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
-    """Eliminate the points from the normal equations by the Schur complement. The function writes
-    the upper triangle of S and the right-hand side of the reduced camera system ``S x = rhs``. It
-    also writes the inverses of the damped point blocks."""
+    """Eliminate the points from the normal equations by the Schur complement.
+
+    The upper triangle of the reduced camera system ``S x = rhs`` is written into ``S`` and ``rhs``.
+    The inverses of the damped point blocks are written into ``V_inverse``.
+    """
     first, camera, used = observations.first, observations.camera, observations.used
     W, V, g, U, b = equations
     S[:] = 0.0
@@ -361,7 +357,7 @@ def invert_damped(V, damping, N):
 
 @kernel
 def step_points(n_free, observations, equations, camera_step, V_inverse, points, points_trial):
-    """Compute the step of each point from the steps of the cameras (back-substitution)."""
+    """Compute the steps of the points from the steps of the cameras (back-substitution)."""
     first, camera, used = observations.first, observations.camera, observations.used
     W, g = equations.W, equations.g
     for p in range(len(points)):

@@ -1,9 +1,9 @@
 """Estimates a constant error of all disparities of a stereo pair from the motion of the camera.
 
 Two calibration errors cause such an offset. The rotation between the two cameras may be wrong by
-some hundredths of a degree, or a principal point may be wrong by a tenth of a pixel. Both errors
-shift all disparities by nearly the same amount. Depths are then wrong by a fraction that grows with
-the depth.
+some hundredths of a degree. A principal point may be wrong by a tenth of a pixel. Both errors shift
+all disparities by nearly the same amount. Depths are then wrong by a fraction that grows with the
+depth.
 
 The offset cannot be determined from a single stereo pair. It can be determined from a moving
 camera, because one motion must explain how both near and far points move in the image. Therefore,
@@ -39,7 +39,7 @@ TOLERANCE = 1e-5  # least relative decrease of the cost; STEP changes it by some
 
 def map_and_calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Run local mapping for a new keyframe (``map_keyframe``). For a stereo camera, the disparity
-    offset of the map is also updated after every ``stereo.offset_keyframes`` keyframes."""
+    offset of the map is updated after every ``stereo.offset_keyframes`` keyframes."""
     map_keyframe(map_, keyframe, camera, config)
     if config.stereo.offset_sigma > 0.0 and camera.sensor == "stereo":
         _calibrate(map_, keyframe, camera, config)
@@ -73,12 +73,11 @@ def offset_sigma(information: float, config: StereoConfig) -> float:
     """Compute the standard deviation of the disparity offset, in pixels, that is caused by the
     noise of the measurements.
 
-    The offset is estimated with a prior of mean 0, which makes the estimate smaller than the true
-    offset. The result does not include this error.
+    The prior of mean 0 makes the estimated offset smaller than the true offset. The result does not
+    include this error.
 
     Args:
-        information: sum of the information (inverse variance) of the measurements, see
-            ``Scalars.offset_information``.
+        information: see ``Scalars.offset_information``.
     """
     if information <= 0.0:
         return 0.0

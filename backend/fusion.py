@@ -17,13 +17,12 @@ from vslam.reprojection import chi_square_ratio, unpacked
 
 
 def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Fuse the landmarks of a keyframe with the landmarks of its neighbours. Landmarks that
-    represent the same point in the world are merged.
+    """Fuse the landmarks of a keyframe with the landmarks of its neighbours.
 
     The landmarks of the keyframe are projected into its neighbours, and the landmarks of the
     neighbours into the keyframe. If a projected landmark matches a feature that observes another
-    landmark, the two landmarks are merged. If a projected landmark matches a feature without a
-    landmark, the feature becomes an observation of the projected landmark.
+    landmark, the two landmarks are merged. If the feature has no landmark, it becomes an
+    observation of the projected landmark.
     """
     neighbours = fusion_neighbours(map_, keyframe, config)
     for neighbour in neighbours:
@@ -33,12 +32,12 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
 
 
 def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
-    """Find the neighbours of a keyframe whose landmarks are fused with the landmarks of the
-    keyframe (ORB-SLAM2). Returns the ids of the neighbours.
+    """Return the ids of the keyframes whose landmarks are fused with the landmarks of a keyframe
+    (ORB-SLAM2).
 
-    The neighbours are the ``mapping.fuse_neighbours`` keyframes that share the most landmarks with
-    the keyframe. For each of these neighbours, the five keyframes that share the most landmarks
-    with the neighbour are also included.
+    First, they are the ``mapping.fuse_neighbours`` keyframes that share the most landmarks with the
+    keyframe. For each of these keyframes, the five keyframes that share the most landmarks with it
+    are added.
     """
     first, _ = map_.covisible(keyframe)
     chosen = first[: config.mapping.fuse_neighbours].tolist()
@@ -59,16 +58,16 @@ def fuse_loop(
     camera: Camera,
     config: Config,
 ) -> int:
-    """Fuse the landmarks on one side of a loop with the landmarks on the other side, after the loop
-    was corrected (section VII-D of the ORB-SLAM paper).
+    """Fuse the landmarks on the two sides of a loop, after the loop was corrected (section VII-D of
+    the ORB-SLAM paper).
 
-    Loop verification has matched features with landmarks. These pairs are fused first. Then the
-    landmarks of each side are projected into the keyframes of the other side.
+    The matches of loop verification are fused first. Then the landmarks of each side are projected
+    into the keyframes of the other side.
 
     Args:
         edge: the loop. Its ``features`` and ``landmarks`` must be set.
-        query_side, match_side: ids of the keyframes around the two ends of the loop. The poses of
-            these keyframes must already be corrected.
+        query_side, match_side: ids of the keyframes around the two ends of the loop. Their poses
+            must already be corrected.
 
     Returns:
         Number of fusions.

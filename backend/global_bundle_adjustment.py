@@ -1,9 +1,9 @@
 """Global bundle adjustment: optimises hundreds of keyframes whose trajectory contains loops.
 
 The problem, the loss and the optimisation steps are the same as in ``bundle_adjustment``. Only the
-reduced camera system is solved differently. In this system, keyframes that share no landmark are
-not coupled. The system is therefore stored as sparse 6x6 blocks and factorised by
-``block_cholesky`` (Triggs et al., "Bundle adjustment - a modern synthesis", section 6.3).
+reduced camera system is solved differently. Keyframes that share no landmark are not coupled in
+this system. It is therefore stored as sparse 6x6 blocks and factorised by ``block_cholesky``
+(Triggs et al., "Bundle adjustment - a modern synthesis", section 6.3).
 """
 
 from __future__ import annotations
@@ -34,14 +34,12 @@ def adjust_globally(
     tolerance: float = 1e-6,
     stop: Callable[[], bool] | None = None,
 ) -> BundleSolution:
-    """Minimise the robust reprojection error of many keyframes.
-
-    The function does the same as ``bundle_adjustment.adjust``, but it exploits the sparsity of the
-    problem. A keyframe must not observe a landmark more than once. The global interpreter lock is
-    released nearly all the time.
+    """Minimise the robust reprojection error of many keyframes, like ``bundle_adjustment.adjust``,
+    but exploiting the sparsity of the problem. The global interpreter lock is released nearly all
+    the time.
 
     Args:
-        iterations: maximum number of Levenberg-Marquardt iterations.
+        problem: a keyframe must not observe a landmark more than once.
         tolerance: the optimisation stops when an iteration reduces the cost by a smaller fraction
             than this.
         stop: called before each iteration. If it returns True, the current estimate is returned.
@@ -108,10 +106,9 @@ def adjust_globally(
 def working_order(first, rank, n_cameras):
     """Sort points and observations for cache-friendly access to the reduced camera system.
 
-    The observations of a point are sorted by the elimination order of their cameras. The earlier of
-    two observations then determines the column of their block, and the later one determines the
-    row. Points are sorted by their first camera. Blocks that are written one after another are then
-    close together in memory.
+    The observations of a point are sorted by the elimination order of their cameras. Points are
+    sorted by their first camera. Blocks that are written one after another are then close together
+    in memory.
 
     Args:
         first: ``(P + 1,)``, see ``BundleProblem``.
@@ -149,8 +146,8 @@ def working_order(first, rank, n_cameras):
 
 @kernel
 def coupled_cameras(first, camera, n_free):
-    """Find all pairs of free cameras that observe a common point. Returns ``(M, 2)`` int64 indices.
-    Each pair occurs once."""
+    """Return the ``(M, 2)`` int64 pairs of free cameras that observe a common point. Each pair
+    occurs once."""
     start, points = points_of_cameras(first, camera, n_free)
     met = np.empty(n_free, np.int64)
     last = np.full(n_free, -1)  # the last camera ``i`` that each camera was paired with
@@ -174,7 +171,7 @@ def points_of_cameras(first, camera, n_free):
     """List the points that each free camera observes.
 
     Returns:
-        ``start``, an int64 array, and ``points``, ``(N,)`` int32. Camera k observes
+        ``start``, int64, and ``points``, ``(N,)`` int32. Camera k observes
         ``points[start[k]:start[k + 1]]``.
     """
     start = np.zeros(n_free + 2, np.int64)
@@ -194,12 +191,8 @@ def points_of_cameras(first, camera, n_free):
 
 @inner_kernel
 def cameras_met(i, start, points, first, camera, n_free, last, met):
-    """Find the free cameras that have a larger index than ``i`` and observe a point that camera
-    ``i`` also observes.
-
-    The indices of these cameras are written into ``met``, and their number is returned. The array
-    ``last`` is used to list each camera only once.
-    """
+    """Write into ``met`` the indices of the free cameras after ``i`` that observe a point of camera
+    ``i``, and return their number. The array ``last`` is used to list each camera only once."""
     n = 0
     for p in points[start[i] : start[i + 1]]:
         for o in range(first[p], first[p + 1]):
@@ -213,9 +206,8 @@ def cameras_met(i, start, points, first, camera, n_free, last, met):
 
 @kernel
 def pair_slots(structure, first, camera, n_free):
-    """For each pair of observations of the same point, find the block that couples their two
-    cameras. Returns ``(N,)`` int32 slots, which are the positions of these blocks in the Cholesky
-    factor.
+    """For each pair of observations of the same point, find the block of the Cholesky factor that
+    couples their two cameras. Returns ``(N,)`` int32 slots.
 
     The pairs are in the order in which ``reduce_points_sparsely`` visits them. Cameras are in
     elimination order.
@@ -247,10 +239,10 @@ def pair_slots(structure, first, camera, n_free):
 def reduce_points_sparsely(
     structure, slots, n_free, observations, equations, damping, S, x, V_inverse
 ):
-    """Eliminate the points from the normal equations by the Schur complement, which gives the
-    reduced camera system ``S x = rhs``.
+    """Eliminate the points from the normal equations by the Schur complement.
 
-    ``S`` is written as panels of ``block_cholesky``. The right-hand side is written into ``x``.
+    The reduced camera system is ``S x = rhs``. Its matrix is written into ``S`` as panels of
+    ``block_cholesky``, and its right-hand side into ``x``.
     """
     first, camera = observations.first, observations.camera
     W, V, g, U, b = equations

@@ -26,14 +26,11 @@ class GlobalSnapshot:
     """A copy of the map as a bundle problem, with the ids of its cameras, points and observations.
 
     Attributes:
-        problem: the bundle problem. The keyframes that are optimised come first, followed by the
-            keyframes that are held fixed.
         keyframes: ``(K,)`` int64 keyframe id of each camera of the problem.
         landmarks: ``(P,)`` int32 landmark id of each point of the problem.
         rows: ``(O,)`` int64 row of each observation in the observation arrays of the map.
-        n_keyframes, n_landmarks: numbers of keyframes and landmarks that had ever been created at
-            the time of the snapshot. A keyframe is newer than the snapshot if its id is at least
-            ``n_keyframes``. A landmark is newer if its id is at least ``n_landmarks``.
+        n_keyframes, n_landmarks: first ids of the keyframes and landmarks that are newer than the
+            snapshot.
     """
 
     problem: BundleProblem
@@ -45,8 +42,8 @@ class GlobalSnapshot:
 
 
 def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
-    """Copy the map into a bundle problem for global bundle adjustment. Keyframes and landmarks that
-    have been culled are left out.
+    """Copy the map, without culled keyframes and landmarks, into a bundle problem for global bundle
+    adjustment.
 
     The first keyframe of each connected part of the map is held fixed, because nothing else
     determines the position of this part. Two keyframes are connected if they observe a common
@@ -64,8 +61,8 @@ def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
 
 @kernel
 def connected_parts(a, landmarks, n_keyframes):
-    """Find the connected part of the map that each keyframe belongs to. A part is denoted by its
-    first keyframe, so the result is the ``(K,)`` int64 id of this keyframe.
+    """Find the connected part of the map that each keyframe belongs to. Returns ``(K,)`` int64, the
+    id of the first keyframe of the part.
 
     Two keyframes are connected if they observe a common landmark. The parts are found by
     union-find.
@@ -93,13 +90,12 @@ def connected_parts(a, landmarks, n_keyframes):
 
 
 def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution) -> None:
-    """Apply the result of global bundle adjustment to the map. The map may have changed since the
+    """Apply the result of global bundle adjustment to the map, which may have changed since the
     snapshot.
 
-    Keyframes and landmarks of the snapshot that still exist are moved to their new positions. Newer
-    keyframes keep their pose relative to their parent in the spanning tree (Mur-Artal and Tardós,
-    ORB-SLAM2, section III-D). Newer landmarks move with their anchor keyframe. An observation that
-    failed the chi-square test is removed if its feature still observes the same landmark.
+    Newer keyframes keep their pose relative to their parent in the spanning tree (ORB-SLAM2,
+    section III-D). Newer landmarks move with their anchor keyframe. Observations that failed the
+    chi-square test are removed, unless their features have been assigned to other landmarks since.
     """
     a = map_.arrays
     T_cw_old = a.T_cw[: map_.n_keyframes].copy()
@@ -121,9 +117,8 @@ def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution
 
 @kernel
 def remove_unchanged(a, rows, landmarks):
-    """Remove N observations that still exist unchanged. ``rows`` gives their ``(N,)`` rows in the
-    observation arrays of the map. An observation is removed only if it still belongs to the given
-    landmark."""
+    """Remove the observations in ``(N,)`` rows of the observation arrays of the map that still
+    belong to the given ``(N,)`` landmarks."""
     for i in range(len(rows)):
         if a.landmark[rows[i]] == landmarks[i]:
             unlink(a, rows[i])

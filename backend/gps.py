@@ -17,9 +17,8 @@ fix. For this reason, all fixes within ``CORRELATION_S`` together have the weigh
 The drift of a metric map depends on the camera, its calibration and the loops that were closed.
 However, the pose graph has a single drift model for all maps. With this model, a map with little
 drift would be bent towards the bias of the fixes. Therefore, the standard deviations of all tree
-and covisibility edges are multiplied by a common factor. The optimisation is repeated with several
-factors, and the factor that maximises the marginal likelihood of the fixes is chosen (empirical
-Bayes: MacKay, Bayesian Interpolation, 1992).
+and covisibility edges are multiplied by a common factor. The factor that maximises the marginal
+likelihood of the fixes is chosen (empirical Bayes: MacKay, Bayesian Interpolation, 1992).
 """
 
 from __future__ import annotations
@@ -91,14 +90,12 @@ class Positions:
     sigma: Array
 
     def select(self, chosen: NDArray[np.bool_]) -> Positions:
-        """Return the positions for which ``chosen``, an ``(M,)`` bool array, is True."""
         return Positions(*(values[chosen] for values in vars(self).values()))
 
     @property
     def crowding(self) -> Array:
-        """Count the positions in a time window of ``CORRELATION_S`` around each position. Returns
-        ``(M,)`` numbers. Each position is itself included in its count.
-        """
+        """``(M,)`` numbers of positions in a time window of ``CORRELATION_S`` around each position,
+        including the position itself."""
         times = np.sort(self.seconds)
         first = np.searchsorted(times, self.seconds - 0.5 * CORRELATION_S, "left")
         last = np.searchsorted(times, self.seconds + 0.5 * CORRELATION_S, "right")
@@ -115,9 +112,9 @@ class Anchored:
         used: ``(M,)`` bool, True for GPS fixes that passed the chi-square test.
         residual_m: root mean square distance of the used fixes from the trajectory.
         S_enu_w: ``(4, 4)`` alignment of the whole map before the optimisation.
-        level: whether the fixes determine the rotation of the map about every axis. The value is
-            False if the fixes lie on a straight line. The rotation about the line is then
-            determined by the assumption that the camera is upright.
+        level: whether the fixes determine the rotation of the map about every axis. It is False if
+            the fixes lie on a straight line. The rotation about the line is then determined by the
+            assumption that the camera is upright.
     """
 
     T_enu_k: Array
@@ -131,17 +128,14 @@ class Anchored:
 def anchor(
     graph: PoseGraph, seconds: Array, positions: Positions, config: PoseGraphConfig, *, metric: bool
 ) -> Anchored:
-    """Georeference a finished map.
-
-    The keyframes are moved to the poses in the ENU frame that agree best with the essential graph
-    and the GPS fixes.
+    """Georeference a finished map: find the poses of the keyframes in the ENU frame that agree best
+    with the essential graph and the GPS fixes.
 
     Args:
-        graph: the essential graph of the map.
         seconds: ``(N,)`` times of the keyframes.
-        metric: whether the unit of the map is the metre, apart from errors of the calibration. It
-            must be False for a monocular map. In this case, the scale and its drift are estimated
-            without a prior.
+        metric: whether the unit of the map is the metre, apart from errors of the calibration. For
+            a monocular map, it must be False. The scale and its drift are then estimated without a
+            prior.
 
     Raises:
         InputError: the camera travelled too short a distance to determine the direction of travel.
@@ -205,17 +199,15 @@ class Alignment:
 def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> Alignment:
     """Align a map with its GPS fixes using RANSAC.
 
-    The scale of a metric map is estimated as well, because the calibration may be inaccurate. For
-    example, if the calibrated baseline is 1 % too long, the map is 1 % too large. The estimate is a
-    weighted mean of two scales: the scale that the fixes suggest, and the scale of the calibration,
-    which is 1. The weights are the inverse variances. ``_METRIC`` is the standard deviation of the
-    calibrated scale.
+    The scale of a metric map is estimated as well, because the calibration may be inaccurate. The
+    result is a weighted mean of two scales: the scale that the fixes suggest, and the calibrated
+    scale, which is 1. The weights are the inverse variances. ``_METRIC`` is the standard deviation
+    of the calibrated scale.
 
     Args:
         T_wk: ``(N, 4, 4)`` poses of the keyframes in the map (camera to world).
         positions: at least three GPS positions.
         metric: see ``anchor``.
-        seed: seed of the random samples.
     """
     k, enu = positions.keyframe, positions.enu
     path = _points(T_wk[k], positions.arm)
@@ -256,12 +248,10 @@ def align(T_wk: Array, positions: Positions, *, metric: bool, seed: int = 0) -> 
 
 def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
     """Compute the ``(..., 4, 4)`` similarity transforms that map ``(..., M, 3)`` points p to points
-    q (Umeyama's closed form). Their scale is ``fixed``. If ``fixed`` is None, the scale is
-    estimated.
+    q (Umeyama's closed form). Their scale is ``fixed``, or is estimated if ``fixed`` is None.
 
     Points on a line do not determine the rotation about this line. In this case, the upward axes
-    ``up`` of the camera determine the rotation. In all other cases, these axes have so little
-    weight that they hardly affect the result.
+    ``up`` of the camera determine it. In all other cases, these axes hardly affect the result.
     """
     p_mean, q_mean = p.mean(axis=-2), q.mean(axis=-2)
     p0, q0 = p - p_mean[..., None, :], q - q_mean[..., None, :]
@@ -285,14 +275,13 @@ def _umeyama(p: Array, q: Array, up: Array, fixed: float | None) -> Array:
 
 
 def _mapped(S: Array, points: Array) -> Array:
-    """Transform ``(M, 3)`` points by ``(..., 4, 4)`` similarities. The result has the shape
-    ``(..., M, 3)``."""
+    """Transform ``(M, 3)`` points by ``(..., 4, 4)`` similarities. Returns ``(..., M, 3)``."""
     return points @ np.swapaxes(S[..., :3, :3], -2, -1) + S[..., None, :3, 3]
 
 
 def _aligned(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
-    """Apply the similarity transform ``S_enu_w`` to the poses of the keyframes. Returns the new
-    poses ``T_enu_k`` and the scales."""
+    """Return the poses ``T_enu_k`` and the scales of the keyframes after the similarity
+    ``S_enu_w``."""
     scale = float(scale_of(S_enu_w))
     T_enu_k = S_enu_w @ T_wk
     T_enu_k[:, :3, :3] /= scale
@@ -300,13 +289,12 @@ def _aligned(T_wk: Array, S_enu_w: Array) -> tuple[Array, Array]:
 
 
 def _points(T: Array, points: Array) -> Array:
-    """Transform each of ``(M, 3)`` points by the corresponding pose of ``(M, 4, 4)`` poses."""
+    """Transform each of ``(M, 3)`` points by the pose with the same index."""
     return np.einsum("mij,mj->mi", T[:, :3, :3], points) + T[:, :3, 3]
 
 
 def _antenna(positions: Positions, scale: Array) -> Array:
-    """Compute the ``(M, 3)`` positions of the antenna, in metres. Each position is given in the
-    frame of its keyframe."""
+    """Return the ``(M, 3)`` positions of the antenna in the frames of the keyframes, in metres."""
     return positions.arm * scale[positions.keyframe, None] + positions.lever
 
 
@@ -322,8 +310,8 @@ def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int
     """Estimate the scale of the map at each keyframe, as ``(N,)`` metres per unit of the map.
 
     The scale is the length of the path around the keyframe in ENU, divided by the length of the
-    same path in the map. The path stays within the keyframe's part of the map. Where the length of
-    the path is 0, the given ``scale`` is returned.
+    same path in the map. The path stays within the keyframe's part of the map. Where its length is
+    0, the given ``scale`` is returned.
     """
     scale = scale.copy()
     for label in np.unique(part):
@@ -343,9 +331,9 @@ def _likeliest(
     """Optimise the poses with each factor of the drift model in ``_DRIFTS``. Returns the ``(N, 4,
     4)`` poses for the factor that maximises the likelihood of the fixes, given the edges.
 
-    The likelihood of the fixes is an integral over all poses of the keyframes. It is computed by
-    Laplace's approximation. This approximation depends on the error at the optimum and on the
-    determinants of the normal matrices with and without the fixes.
+    The likelihood is an integral over all poses of the keyframes. Laplace's approximation depends
+    on the error at the optimum and on the determinants of the normal matrices with and without the
+    fixes.
 
     Args:
         factors: the function ``_factors``, with all arguments except ``drift``.
@@ -371,9 +359,9 @@ def _likeliest(
 
 
 def _log_determinant(factors: Any, values: Any) -> float:
-    """Return the logarithm of the determinant of the normal matrix. The result is NaN if GTSAM
-    cannot factorise the matrix. This happens if the edges have much smaller standard deviations
-    than the priors, for example on a drive of less than a metre."""
+    """Return the log determinant of the normal matrix, or NaN if GTSAM cannot factorise the matrix.
+    This happens if the edges have much smaller standard deviations than the priors, for example on
+    a drive of less than a metre."""
     try:
         # GTSAM returns the log determinant of the triangular root.
         return 2.0 * float(factors.linearize(values).eliminateMultifrontal().logDeterminant())
@@ -382,8 +370,6 @@ def _log_determinant(factors: Any, values: Any) -> float:
 
 
 def _optimised(factors: _Factors, config: PoseGraphConfig) -> Array:
-    """Find the ``(N, 4, 4)`` poses of the keyframes that agree best with the edges and the
-    fixes."""
     factors.vision.push_back(factors.fixes)
     return _poses(minimised(factors.vision, factors.start, config))
 
@@ -418,8 +404,7 @@ def _factors(
     stretch: float = 0.0,
     drift: float = 1.0,
 ) -> _Factors:
-    """Create the factors of a pose-graph optimisation with GPS: factors for the edges and factors
-    for the fixes. The optimisation starts from the poses ``T_enu_k``.
+    """Create the factors of a pose-graph optimisation with GPS, which starts from ``T_enu_k``.
 
     Args:
         cauchy: scale of the Cauchy loss of the fixes, in standard deviations of the fixes; None

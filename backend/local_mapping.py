@@ -26,11 +26,7 @@ RECENT_KEYFRAMES = 3  # how long a landmark is on probation, in keyframes (ORB-S
 
 
 def map_keyframe(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Run local mapping for a new keyframe. The keyframe must already be linked to its landmarks.
-
-    The steps are: cull recent landmarks, triangulate new landmarks, fuse landmarks, run local
-    bundle adjustment, and cull keyframes.
-    """
+    """Run local mapping for a new keyframe, which must already be linked to its landmarks."""
     cull_recent_landmarks(map_, keyframe, camera, config)
     triangulate_with_neighbours(map_, keyframe, camera, config)
     refresh_keyframe(map_, keyframe)
@@ -73,8 +69,8 @@ def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 
     The keyframe, its covisible keyframes and all landmarks that these keyframes observe are
     optimised. Other keyframes that observe these landmarks are held fixed. The first keyframe of
-    the map is also held fixed, because it defines the world frame. After the optimisation,
-    observations that fail the chi-square test are removed.
+    the map is also held fixed, because it defines the world frame. Afterwards, observations that
+    fail the chi-square test are removed.
     """
     free, fixed, landmarks = local_window(map_, keyframe, config)
     problem, rows = assemble(map_, free, fixed, landmarks, camera)
@@ -96,8 +92,7 @@ def local_window(
     map_: Map, keyframe: int, config: Config
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
     """Select the keyframes and landmarks of local bundle adjustment. Returns the ids of the
-    keyframes that are optimised, the ids of the keyframes that are held fixed, and the ids of the
-    landmarks."""
+    keyframes that are optimised, of the keyframes that are held fixed, and of the landmarks."""
     strong = strong_neighbours(map_, keyframe, config)
     window = np.concatenate([[keyframe], strong])[: config.mapping.max_ba_keyframes]
     landmarks, others = window_landmarks(
@@ -115,11 +110,11 @@ def local_window(
 
 
 def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.int64]:
-    """Return the ids of the neighbours of a keyframe in the covisibility graph. The neighbour that
-    shares the most landmarks comes first.
+    """Return the ids of the neighbours of a keyframe in the covisibility graph, those that share
+    the most landmarks first.
 
-    Neighbours that share few landmarks are left out. If all neighbours share few landmarks, only
-    the best neighbour is returned (section III-D of the ORB-SLAM paper).
+    Neighbours that share few landmarks are left out, except the best neighbour (section III-D of
+    the ORB-SLAM paper).
     """
     neighbours, shared = map_.covisible(keyframe)
     return neighbours[(shared >= config.mapping.min_shared) | (np.arange(len(shared)) == 0)]
@@ -128,10 +123,10 @@ def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.in
 @kernel
 def window_landmarks(a, window, n_landmarks, n_keyframes):
     """Find the landmarks that the keyframes of a window observe, and the other keyframes that
-    observe these landmarks.
+    observe them.
 
-    Returns the ``(P,)`` int32 ids of the landmarks, and a ``(K,)`` bool mask of the other
-    keyframes.
+    Returns:
+        The ``(P,)`` int32 ids of the landmarks, and a ``(K,)`` bool mask of the other keyframes.
     """
     seen = np.zeros(n_landmarks, np.bool_)
     others = np.zeros(n_keyframes, np.bool_)
@@ -189,19 +184,18 @@ def assemble(
 
 @kernel
 def remove_observations(a, rows):
-    """Remove N observations. ``rows`` gives their ``(N,)`` rows in the observation arrays of the
-    map. Rows that no longer hold an observation are skipped."""
+    """Remove the observations in ``(N,)`` rows of the observation arrays of the map. Rows that no
+    longer hold an observation are skipped."""
     for row in rows:
         if a.landmark[row] >= 0:
             unlink(a, row)
 
 
 def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
-    """Cull redundant keyframes among the covisible keyframes of a keyframe.
+    """Cull redundant keyframes among the covisible keyframes of a keyframe (section VI-E of the
+    ORB-SLAM paper).
 
-    A keyframe is redundant if most of its close landmarks are also observed by at least three other
-    keyframes, at a finer or about the same scale (section VI-E of the ORB-SLAM paper). For a
-    monocular camera, all landmarks count as close.
+    A keyframe is redundant if most of its close landmarks are redundant (``count_redundant``).
     """
     neighbours, shared = map_.covisible(keyframe)
     close = config.stereo.close_depth_baselines * camera.baseline
@@ -217,7 +211,6 @@ def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
 @kernel
 def count_redundant(a, keyframe, bf, close_depth):
     """Count the close landmarks of a keyframe, and count how many of these landmarks are redundant.
-    Returns both numbers.
 
     A landmark is redundant if at least three other keyframes observe it at a finer or about the
     same scale. If ``bf`` is 0 (monocular camera), all landmarks count as close.

@@ -15,14 +15,13 @@ def move_keyframes(
 ) -> None:
     """Set the poses of keyframes, and move each landmark rigidly with its anchor keyframe.
 
-    The anchor of a landmark is the keyframe that first observed the landmark (section VII-C of the
-    ORB-SLAM paper). If that keyframe was culled, the anchor is the oldest keyframe that observes
-    the landmark. A landmark whose anchor is not among ``keyframes`` does not move.
+    The anchor of a landmark is the keyframe that first observed it (section VII-C of the ORB-SLAM
+    paper). If that keyframe was culled, the anchor is the oldest keyframe that observes the
+    landmark. A landmark whose anchor is not among ``keyframes`` does not move.
 
-    The landmark keeps its position relative to the anchor. Its distance range therefore stays the
-    same, and its normal is rotated with the anchor. The distance range and the normal are exact
-    only if all keyframes that observe the landmark move in the same way. Culled keyframes need no
-    update, because their poses are stored relative to other keyframes.
+    The distance range of a landmark stays the same, and its normal is rotated with the anchor. Both
+    are exact only if all keyframes that observe the landmark move in the same way. Culled keyframes
+    need no update, because their poses are stored relative to other keyframes.
 
     Args:
         keyframes: ``(N,)`` ids of keyframes that have not been culled.
@@ -40,7 +39,7 @@ def move_keyframes(
 
 
 def carry_landmarks(map_: Map, landmarks: NDArray[np.int64], T_cw_old: NDArray[np.float64]) -> None:
-    """Move landmarks rigidly with their anchor keyframes. The keyframes have already moved from
+    """Move landmarks rigidly with their anchor keyframes, which have already moved from
     ``T_cw_old`` to their current poses in the map.
 
     Args:
@@ -56,10 +55,9 @@ def carry_landmarks_by(map_: Map, motion: NDArray[np.float64], moved: NDArray[np
     """Move all landmarks by the given motions of their anchor keyframes.
 
     Args:
-        motion: ``(K, 4, 4)`` motion of each keyframe: a transform in the world frame, which is
-            applied to all landmarks that are anchored in the keyframe. If the transforms are
-            similarities, the caller must refresh the normals and distance ranges of the landmarks
-            afterwards.
+        motion: ``(K, 4, 4)`` transforms in the world frame, one for each anchor keyframe. If they
+            are similarities, the caller must refresh the normals and distance ranges of the
+            landmarks afterwards.
         moved: ``(K,)`` bool, True for keyframes that move. For the other keyframes, ``motion`` is
             ignored.
     """
@@ -99,8 +97,8 @@ def _carry(a, landmarks, motion, moved):
 
 @inner_kernel
 def anchor_of(a, landmark):
-    """Return the id of the anchor of a landmark, which is the keyframe that the landmark moves
-    with. Returns -1 if no keyframe of the map observes the landmark."""
+    """Return the id of the keyframe that a landmark moves with, or -1 if no keyframe observes the
+    landmark."""
     first = a.first_keyframe[landmark]
     if a.keyframe_alive[first]:
         return first

@@ -35,10 +35,10 @@ class PoseGraph:
         T_cw: ``(N, 4, 4)`` initial poses (world to camera).
         edges: ``(E, 2)`` int64 indices i, j into ``keyframes``.
         T_i_j: ``(E, 4, 4)`` measured pose of camera j in the frame of camera i.
-        kind: ``(E,)`` uint8 kind of each edge: TREE, COVISIBLE, WEAK, LOOP or GAP.
+        kind: ``(E,)`` uint8: TREE, COVISIBLE, WEAK, LOOP or GAP.
         sigmas: ``(E, 2)`` standard deviations per axis of translation (m) and rotation (rad).
-        fixed: ``(N,)`` bool, True for keyframes that are held fixed. There is one such keyframe in
-            each connected part of the graph.
+        fixed: ``(N,)`` bool, True for keyframes that are held fixed: one in each connected part of
+            the graph.
         scale: ``(E,)`` factor that converts lengths from the unit of length around keyframe j to
             the unit of length around keyframe i. ``T_i_j`` is in the unit around i. The factor
             differs from 1 only for loops of monocular maps, whose scale drifts
@@ -88,24 +88,22 @@ def essential_graph(
     the new loop changes the map.
 
     The measurements of tree and covisibility edges are taken from the poses in the map. If
-    landmarks of the new loop were already fused, keyframes on both sides of the loop would be
-    covisible. The edges between these keyframes would then preserve the drift. Therefore, correct
-    the map and fuse landmarks only after the graph has been found to be consistent.
+    landmarks of the new loop were already fused, there would be edges across the loop that preserve
+    the drift. Therefore, correct the map and fuse landmarks only after the graph has been found to
+    be consistent.
 
     A loop edge replaces any other edge between its two keyframes. A culled keyframe of a loop is
     replaced by the keyframe that its pose is stored relative to. If several loops then connect the
     same two keyframes, only the last loop is used.
 
-    If the camera was lost between the two keyframes of a tree edge, these keyframes share hardly
-    any landmarks. The relative pose of such keyframes was not measured. At best, it was predicted.
-    The edge is a GAP edge if the pose was predicted and ``driven`` is true. Otherwise it is a WEAK
-    edge.
+    If the camera was lost between the two keyframes of a tree edge, their relative pose was not
+    measured. The edge is a GAP edge if the pose was predicted and ``driven`` is true, and a WEAK
+    edge otherwise.
 
     Args:
         loops: all closed loops, with the new loop at the end. Each loop must have a pose.
-        driven: whether the camera is on a vehicle. The motion of a vehicle during a gap can be
-            predicted roughly, so a GAP edge has some weight. A camera that is not on a vehicle may
-            have been carried anywhere, so a WEAK edge has almost no weight.
+        driven: whether the camera is on a vehicle, whose motion during a gap can be predicted
+            roughly. Any other camera may have been carried anywhere.
 
     Raises:
         ValueError: a loop has no pose.
@@ -164,9 +162,8 @@ def connectivity(map_: Map) -> NDArray[np.int64]:
     """Measure how well each keyframe and all later keyframes are connected to the earlier
     keyframes. Returns ``(n_keyframes,)`` int64.
 
-    For each keyframe, all pairs of keyframes are considered in which one keyframe is earlier than
-    the given keyframe and the other keyframe is not. The value is the largest number of landmarks
-    that such a pair shares. The value is 0 for the first keyframe.
+    The value of a keyframe is the largest number of landmarks that an earlier keyframe shares with
+    this or a later keyframe. It is 0 for the first keyframe.
     """
     living = map_.living_keyframes()
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, 1)
@@ -178,9 +175,8 @@ def connectivity(map_: Map) -> NDArray[np.int64]:
 
 
 def _spans(pair: tuple[int, int], keyframes: NDArray[np.int64]) -> bool:
-    """Return whether any of the ids ``keyframes`` is greater than the first id of a pair and at
-    most equal to the second id of the pair. ``keyframes`` must be sorted.
-    """
+    """Return whether any of the sorted ids ``keyframes`` is greater than the first id of a pair and
+    at most equal to the second."""
     low, high = np.searchsorted(keyframes, pair, side="right")
     return bool(low < high)
 
@@ -196,20 +192,17 @@ def edge_sigmas(
     """Compute the ``(E, 2)`` standard deviations of the edges: translation (m) and rotation (rad).
 
     Drift is modelled as a random walk, so the variance of a tree or covisibility edge grows with
-    its length. All these edges are derived from the same measurement, the estimated path. If the
-    edges were treated as independent, a path with more edges would have a smaller total
-    uncertainty. Therefore, the variance of an edge is multiplied by the number of edges that span
-    the path at the ends of this edge. All edges together then have the uncertainty of the drift
-    model, regardless of their number.
+    its length. All these edges are derived from the same measurement, the estimated path. If they
+    were treated as independent, a path with more edges would have a smaller total uncertainty.
+    Therefore, the variance of an edge is multiplied by the number of edges that span the path at
+    its ends.
 
-    Two possible errors in the translation of a GAP edge are compared: a fraction of the predicted
+    For the translation of a GAP edge, two possible errors are compared: a fraction of the predicted
     distance, and the distance that a slow car travels in the elapsed time. The larger error is
-    used. A WEAK edge has very large standard deviations, because almost nothing is known about the
-    motion.
+    used. A WEAK edge has very large standard deviations.
 
     Args:
         seconds: ``(E, 2)`` timestamps of the ends of the edges.
-        n: number of keyframes.
     """
     length = np.maximum(np.linalg.norm(T_i_j[:, :3, 3], axis=1), config.min_length)
     tree, path = kind == TREE, (kind == TREE) | (kind == COVISIBLE)
@@ -231,8 +224,8 @@ def edge_sigmas(
 
 
 def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """Find the connected part of the graph that each node belongs to, using union-find. A part is
-    denoted by its first node, so the result is the ``(n,)`` int64 index of this node."""
+    """Find the connected part of the graph that each of ``n`` nodes belongs to. Returns ``(n,)``
+    int64, the index of the first node of the part."""
     part = list(range(n))
 
     def first_of(node: int) -> int:
@@ -248,9 +241,8 @@ def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
 
 
 def load_optimiser() -> None:
-    """Import GTSAM, so that it need not be imported during the first loop closure. The import takes
-    a tenth of a second. During a loop closure, this would be too long, because frames of a live
-    camera would have to wait."""
+    """Import GTSAM in advance. The import takes a tenth of a second, which would delay the frames
+    of a live camera during the first loop closure."""
     import gtsam  # noqa: F401
 
 
@@ -291,7 +283,7 @@ def optimised_values(
         poses: initial values of the N keyframes, as GTSAM objects.
         measured: measurements of the E edges, as GTSAM objects of the same type.
         sigmas: ``(E, D)`` standard deviations of the edges.
-        factor_types: the classes of GTSAM's prior factor and between factor for this type.
+        factor_types: GTSAM's prior factor and between factor for this type.
     """
     import gtsam
 
@@ -330,13 +322,13 @@ def check_pose_graph(
     """Test whether an optimised graph is plausible. If it is not, the new loop is wrong and must be
     rejected.
 
-    There are two tests. The first test checks the residual of each loop edge. A loop edge whose
-    residual is still large contradicts the other loops, or a large part of the path.
+    The first test checks the residual of each loop edge. A loop edge whose residual is still large
+    contradicts the other loops, or a large part of the path.
 
-    The second test checks the strain, which is the total chi-square of the tree, covisibility and
-    gap edges. If the drift follows the model, the strain has six degrees of freedom per closed
-    loop. If the strain is several times larger, no plausible drift explains the loop. A single loop
-    across a WEAK edge always passes the tests, because it causes no strain.
+    The second test checks the strain: the total chi-square of the tree, covisibility and gap edges.
+    If the drift follows the model, the strain has six degrees of freedom per closed loop. If the
+    strain is several times larger, no plausible drift explains the loop. A single loop across a
+    WEAK edge always passes the tests, because it causes no strain.
 
     Args:
         T_cw: ``(N, 4, 4)`` poses that ``optimise`` returned.
@@ -373,9 +365,8 @@ def check_edge_errors(
 
 @kernel
 def edge_errors(T_cw, edges, T_i_j, sigmas):
-    """Compute the ``(E,)`` chi-square of each edge. The residual motion of the edge is expressed as
-    a twist. The twist is divided by the standard deviations. The chi-square is the squared norm of
-    the result."""
+    """Compute the ``(E,)`` chi-square of each edge. The residual motion is expressed as a twist,
+    whose components are divided by the standard deviations."""
     chi2 = np.empty(len(edges))
     for e in range(len(edges)):
         T = compose(T_cw[edges[e, 0]], inverse(T_cw[edges[e, 1]]))

@@ -46,14 +46,12 @@ def scale_of(S: Matrix) -> NDArray[np.float64]:
 
 
 def rigid(S: Matrix) -> Matrix:
-    """Convert ``(..., 4, 4)`` similarities to ``(..., 4, 4)`` rigid motions by setting their scale
-    to 1."""
+    """Set the scale of ``(..., 4, 4)`` similarities to 1."""
     return similarity(S, 1.0 / scale_of(S))
 
 
 def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfig) -> Matrix:
-    """Find the ``(N, 4, 4)`` similarities that agree best with the edges. The optimisation starts
-    from ``S_wc``.
+    """Find the ``(N, 4, 4)`` similarities that agree best with the edges, starting from ``S_wc``.
 
     The loss functions and the optimiser are the same as in ``pose_graph.optimise``. Fixed keyframes
     keep their pose and their scale.
@@ -85,10 +83,7 @@ def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfi
 
 def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     """Compute the ``(E, 7)`` standard deviations of the edges: rotation, translation, and the
-    logarithm of the scale.
-
-    The drift of the scale is modelled as a random walk along the path, like the drift of the pose.
-    """
+    logarithm of the scale. The drift of the scale is modelled as a random walk along the path."""
     scale = graph.sigmas[:, 1] * (config.scale_drift / config.rotation_drift)
     scale[graph.kind == LOOP] = config.loop_scale
     scale[graph.kind == WEAK] = config.weak_scale
@@ -150,8 +145,8 @@ def move_keyframes_similarly(
 
 
 def loop_in_new_units(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
-    """Convert a loop edge to the new units of length after a correction of a monocular map.
-    ``growth`` is the factor by which the correction multiplied lengths around each keyframe."""
+    """Convert a loop edge to the units of length after a correction of a monocular map. ``growth``
+    is the factor by which the correction multiplied lengths around each keyframe."""
     assert edge.T_query_match is not None
     T = edge.T_query_match.copy()
     T[:3, 3] *= growth[edge.match]

@@ -51,9 +51,8 @@ def triangulate_with_neighbours(
 ) -> NDArray[np.int32]:
     """Create landmarks by triangulating features of a keyframe and its covisible keyframes.
 
-    Features that observe no landmark yet are matched along epipolar lines, and the matches are
-    triangulated (section VI-C of the ORB-SLAM paper). Returns the ``(N,)`` ids of the new
-    landmarks.
+    Features that observe no landmark yet are matched along epipolar lines (section VI-C of the
+    ORB-SLAM paper). Returns the ``(N,)`` ids of the new landmarks.
     """
     neighbours, _ = map_.covisible(keyframe)
     created = [np.empty(0, np.int32)]
@@ -85,17 +84,14 @@ def triangulate_with_neighbours(
 
 
 def median_depth(map_: Map, keyframe: int) -> float:
-    """Return the median depth of the landmarks that a keyframe observes. This depth measures the
-    scale of the scene.
-    """
     points, T_cw = map_.arrays.xyz[map_.landmarks_of(keyframe)], map_.arrays.T_cw[keyframe]
     return float(np.median(points @ T_cw[2, :3] + T_cw[2, 3]))
 
 
 @inner_kernel
 def unmapped_rows(a, keyframe):
-    """Find the features of a keyframe that do not observe a landmark. Returns their ``(N,)`` int64
-    rows in the observation arrays of the map."""
+    """Return the ``(N,)`` int64 rows, in the observation arrays of the map, of the features of a
+    keyframe that do not observe a landmark."""
     first, last = a.first_row[keyframe], a.first_row[keyframe + 1]
     return first + np.flatnonzero(a.landmark[first:last] < 0)
 
@@ -220,8 +216,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
 @kernel
 def perpendicular(t):
     """Compute two unit vectors that are orthogonal to the vector ``t`` and to each other. Returns
-    ``(2, 3)``.
-    """
+    ``(2, 3)``."""
     across = np.zeros((2, 3))
     least = 0
     for i in range(1, 3):
@@ -243,8 +238,8 @@ def perpendicular(t):
 def direction(u, v):
     """Return the direction of the line through the origin and (u, v), as a number in [0, 2).
 
-    The number grows with the angle of the line from 0 to 180 degrees. It is computed without
-    trigonometric functions.
+    The number grows with the angle of the line from 0 to 180 degrees. It needs no trigonometric
+    functions.
     """
     if v < 0.0 or (v == 0.0 and u < 0.0):
         u, v = -u, -v
@@ -257,21 +252,21 @@ def direction(u, v):
 def sorted_about_epipole(x, y, gate, intrinsics, across):
     """Index features by the directions of the epipolar planes that they can match.
 
-    All epipolar planes contain the baseline. In a view along the baseline, each plane is therefore
-    a line through the origin and has a direction. A feature matches planes that cross a square
-    around the feature. Half the side of this square is the square root of ``gate``. In the view
-    along the baseline, the square becomes a parallelogram, which covers an interval of directions.
-    If the epipole is inside the square, all directions are covered.
+    All epipolar planes contain the baseline. In a view along the baseline, each plane is a line
+    through the origin and has a direction. A feature matches planes that cross a square around the
+    feature. In the view along the baseline, the square covers an interval of directions, or all
+    directions if the epipole is inside the square.
 
     Args:
         x, y: ``(n,)`` float32, pixels.
-        gate: ``(n,)`` float32, largest squared distance from the epipolar line, pixels squared.
+        gate: ``(n,)`` float32, largest squared distance from the epipolar line, pixels squared. Its
+            square root is half the side of the square.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         across: ``(2, 3)``, the two axes of the view along the baseline, see ``perpendicular``.
 
     Returns:
-        ``start``, with shape ``(SECTIONS + 1,)``, and ``items``, int32. The features near a plane
-        whose direction is in bin s are among ``items[start[s]:start[s + 1]]``, in ascending order.
+        ``start``, ``(SECTIONS + 1,)``, and ``items``, int32. The features near a plane whose
+        direction is in bin s are among ``items[start[s]:start[s + 1]]``, in ascending order.
     """
     n = len(x)
     low, high = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -324,8 +319,8 @@ def dot3(a, b):
 
 @inner_kernel
 def world_ray(T_cw, xy, intrinsics, ray):
-    """Compute the viewing ray of a pixel, and write it into ``ray``, with shape ``(3,)``. The ray
-    is in the world frame. Its length is such that z = 1 in the camera frame."""
+    """Write the viewing ray of a pixel into ``ray``, ``(3,)`` in the world frame. Its length is
+    such that z = 1 in the camera frame."""
     x = (xy[0] - intrinsics[2]) / intrinsics[0]
     y = (xy[1] - intrinsics[3]) / intrinsics[1]
     for i in range(3):
@@ -335,11 +330,10 @@ def world_ray(T_cw, xy, intrinsics, ray):
 @inner_kernel
 def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_cosine, point):
     """Triangulate a landmark from two views, and write its position in the world frame into
-    ``point``, with shape ``(3,)``.
+    ``point``, ``(3,)``.
 
     Usually, the two viewing rays are intersected. If the stereo pair of one keyframe sees the
-    landmark with more parallax than the two rays have, the stereo point of that keyframe is used
-    instead.
+    landmark with more parallax than the two rays have, its stereo point is used instead.
 
     Args:
         depth_1, depth_2: stereo depths of the features; NaN for a feature without stereo depth.
@@ -350,8 +344,8 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
             depth.
 
     Returns:
-        True if the landmark was triangulated. False if there is neither enough parallax nor a
-        stereo depth, or if the rays do not meet in front of both cameras.
+        False if there is neither enough parallax nor a stereo depth, or if the rays do not meet in
+        front of both cameras.
     """
     dot = dot3(ray_1, ray_2)
     square_1, square_2 = dot3(ray_1, ray_1), dot3(ray_2, ray_2)
@@ -384,9 +378,8 @@ def intersect(depth_1, depth_2, ray_1, ray_2, centre_1, centre_2, baseline, max_
 
 @inner_kernel
 def agrees(T, p, xy, u_right, scale, intrinsics):
-    """Return whether a point agrees with an observation. This is the case if the point lies in
-    front of the camera and its reprojection error passes the chi-square test.
-    """
+    """Return whether a point lies in front of the camera and its reprojection error passes the
+    chi-square test."""
     z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
     if z <= 0.0:
         return False

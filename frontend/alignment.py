@@ -37,12 +37,11 @@ def align_frame(
     intrinsics: NDArray[np.float64],
     config: AlignmentConfig,
 ) -> NDArray[np.float32] | None:
-    """Align the matches of a frame: find each matched landmark in the image with sub-pixel
-    accuracy, using an image patch from a keyframe.
+    """Find each matched landmark of a frame in the image with sub-pixel accuracy, using an image
+    patch from a keyframe.
 
     Args:
-        known: image patches of the landmarks. A match is aligned only if its landmark has a patch
-            here.
+        known: image patches of landmarks. Only the matches of these landmarks are aligned.
         scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
@@ -92,20 +91,18 @@ def find_patches(
     """Find the image patches of N landmarks near their expected positions in an image.
 
     Args:
-        pyramid: the pyramid of the image.
         xy: ``(N, 2)`` expected positions, full-resolution pixels.
         octave: ``(N,)`` pyramid levels in which the patches are searched for.
         T_cw: ``(4, 4)`` pose of the camera that took the image (world to camera).
         xyz: ``(N, 3)`` positions of the landmarks, in the world frame.
-        known: image patches of landmarks.
         at: ``(N,)`` index of each landmark's patch in ``known``.
         scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
     Returns:
-        ``(N, 2)`` float32 shift of each patch, in pixels of its octave; NaN if the patch was not
-        found. The shift is the position where the patch was found, minus the expected position. The
-        expected position is first rounded to a whole pixel of the octave.
+        ``(N, 2)`` float32 shift of each patch from its expected position, in pixels of its octave;
+        NaN if the patch was not found. The expected position is first rounded to a whole pixel of
+        the octave.
     """
     view, size = known.view[at], known.size[at]
     warp = warps(T_cw, xyz, known.T_cw, view, size, scales[octave], intrinsics)
@@ -180,10 +177,8 @@ def align(seen, reference, centre, which, warp, iterations, max_shift, min_corre
         reference: ``(P, PATCH_PIXELS)`` uint8 patches of keyframes.
         centre: ``(P, 2)`` float32 position of the landmark in each reference patch, in pixels
             relative to the middle of the patch.
-        which: ``(N,)`` index, into ``reference``, of the patch that is registered to each patch of
-            the frame.
+        which: ``(N,)`` index of the reference patch for each patch of the frame.
         warp: ``(N, 2, 2)`` float32 matrices, see ``warps``.
-        iterations: maximum number of Gauss-Newton steps.
         max_shift: largest accepted shift in x and in y, in pixels of the frame's patch.
         min_correlation: least normalised cross-correlation of an accepted alignment.
 
@@ -224,15 +219,12 @@ def align(seen, reference, centre, which, warp, iterations, max_shift, min_corre
 
 @inner_kernel
 def draw(patch, centre, warp, out):
-    """Warp a patch around ``centre`` with bilinear interpolation.
-
-    The function returns True on success. If the warped window is not inside the patch, it returns
-    False and leaves ``out`` unchanged.
+    """Warp a patch around ``centre`` with bilinear interpolation. Returns False, and leaves ``out``
+    unchanged, if the warped window is not inside the patch.
 
     Args:
         patch: ``(PATCH_PIXELS,)`` uint8.
-        centre: ``(2,)`` float32 position in the patch, in pixels relative to the middle of the
-            patch.
+        centre: ``(2,)`` float32, in pixels relative to the middle of the patch.
         warp: ``(2, 2)`` float32, see ``warps``.
         out: ``(WIDE * WIDE,)`` float32, receives the window.
     """
@@ -271,8 +263,7 @@ def prepare(wide, template, slope_x, slope_y):
     brightness and contrast, so that such changes do not affect the shift.
 
     Returns:
-        Four numbers: the sum of squares of the template, and the entries xx, xy and yy of the 2x2
-        normal matrix.
+        The sum of squares of the template, and the entries xx, xy and yy of the 2x2 normal matrix.
     """
     half, zero, count = np.float32(0.5), np.float32(0.0), np.float32(SIDE * SIDE)
     # Sums of products of 1, the template t and its gradients x, y. Grey values are relative to the
@@ -308,8 +299,8 @@ def prepare(wide, template, slope_x, slope_y):
 
 @inner_kernel
 def compare(image, x, y, template, slope_x, slope_y):
-    """Compare a template with a window of an image. The middle of the window is ``x, y`` pixels
-    from the middle of the image.
+    """Compare a template with the window of an image whose middle is ``x, y`` pixels from the
+    middle of the image.
 
     Returns:
         The sum of squares of the window after its mean is subtracted; the inner product of the

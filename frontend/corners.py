@@ -21,13 +21,9 @@ def fast_scores(pixels, height, width):
     brighter than c + t, or all darker than c - t. The score is the largest such t plus 1, or 0 if
     there is none.
 
-    For an arc of 9 bright pixels, this score is the smallest value in the arc minus c. The score of
-    the pixel is the maximum over all 16 arcs and both polarities. The minima over runs of 2, 4 and
-    8 pixels are used for several arcs. Therefore, only 31 minima and maxima are computed for each
-    polarity.
-
-    Indices are unsigned. The compiler then needs no test for negative indices and vectorises the
-    loop over bytes.
+    The minima over runs of 2, 4 and 8 circle pixels are shared by several arcs of 9. Therefore,
+    only 31 minima and maxima are computed for each polarity. Indices are unsigned, because a test
+    for negative indices would prevent vectorisation.
 
     Args:
         pixels: ``(height * width,)`` uint8.
@@ -89,18 +85,15 @@ def fast_scores(pixels, height, width):
 
 @kernel
 def local_maxima(scores, margin, threshold, threshold_min, cell):
-    """Find the corners of an image by non-maximum suppression: no neighbour of a corner has a
-    higher score.
-
-    The image is divided into square cells. Weak corners are kept only in cells without a strong
-    corner.
+    """Find the corners of an image by non-maximum suppression. The image is divided into square
+    cells. Weak corners are kept only in cells without a strong corner.
 
     Args:
         scores: ``(height, width)`` uint8, see ``fast_scores``.
         margin: width of the border without corners, pixels.
         threshold: corners with a higher score are strong; all other corners are weak.
         threshold_min: pixels whose score is at most this value are not corners.
-        cell: side of the square cells into which the image is divided, pixels.
+        cell: side of the cells, pixels.
 
     Returns:
         ``(n,)`` int32 x and y, in pixels, and ``(n,)`` uint8 scores, in row order.
@@ -149,14 +142,12 @@ def local_maxima(scores, margin, threshold, threshold_min, cell):
 
 @kernel
 def spread(x, y, score, width, height, quota):
-    """Choose up to ``quota`` evenly spread corners. They are the corners with the best score in
-    each cell of a grid.
+    """Choose up to ``quota`` evenly spread corners: those with the best score in each cell of a
+    grid.
 
-    The cells of the grid are as large as possible, but at least ``quota`` cells must contain a
-    corner.
-
-    The cell size is found by bisection, as in Bailo et al. ("Efficient adaptive non-maximal
-    suppression", PRL 2018).
+    The cells are as large as possible, but at least ``quota`` cells must contain a corner. Their
+    size is found by bisection, as in Bailo et al. ("Efficient adaptive non-maximal suppression",
+    PRL 2018).
 
     Args:
         x, y, score: ``(n,)`` corners in row order, see ``local_maxima``.
@@ -240,12 +231,9 @@ def occupies(x, y, width, height, size, quota, is_occupied):
 
 @inner_kernel
 def occupy(x, y, score, width, size, best_of_cell):
-    """Find the corner with the best score in each cell of ``size`` x ``size`` pixels, and write its
-    index into ``best_of_cell``.
-
-    The index is -1 for an empty cell. If several corners have equal scores, the first corner is
-    used.
-    """
+    """Write the index of the best corner of each cell of ``size`` x ``size`` pixels into
+    ``best_of_cell``, or -1 for an empty cell. Of corners with equal scores, the first one is
+    used."""
     columns = (width + size - 1) // size
     best_of_cell[:] = -1
     inverse = np.float32(1.0 / size)

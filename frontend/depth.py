@@ -18,17 +18,16 @@ def columns_of_depth(
     camera: Camera,
     config: DepthConfig,
 ) -> NDArray[np.float32]:
-    """Convert depths to disparities: compute the column that each keypoint would have in the right
-    image of a virtual stereo pair, in pixels.
+    """Compute the column that each keypoint would have in the right image of a virtual stereo pair,
+    in pixels.
 
-    A keypoint at column u whose nearest pixel has depth d gets the column ``u - fx b / d``. In this
-    model, a constant error in pixels corresponds to a depth error that grows with the square of the
-    depth. This relation agrees with the errors of structured-light cameras.
+    A keypoint at column u with depth d gets the column ``u - fx b / d``. A constant error in pixels
+    then corresponds to a depth error that grows with the square of the depth. Structured-light
+    cameras have such errors.
 
-    The depth of a corner at a depth discontinuity is ambiguous. Where the contour of a near object
-    crosses the background, the corner is not a point of the scene. Instead, the corner slides along
-    the contour as the camera moves. Stereo matching rejects most of these corners. With a depth
-    image, corners at a depth discontinuity get no column.
+    Keypoints at a depth discontinuity get no column. Where the contour of a near object crosses the
+    background, a corner is not a point of the scene. It slides along the contour as the camera
+    moves.
 
     Args:
         xy: ``(N, 2)`` keypoints of the left image, pixels.

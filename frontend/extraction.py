@@ -26,14 +26,13 @@ from vslam.workers import Job, Urgency, Workers
 
 class Corners(NamedTuple):
     """The features that a corner detector found in the images of a frame, and their stereo matches.
-    The features and the matches are independent of tracking.
 
     Attributes:
         found: the features of the left image, or of the right image if the left one is black.
         matches: the stereo matches of ``found``; None if there is no right image, or if the left
             one is black.
         depth: ``(H, W)`` float32 depth image of an RGB-D camera, metres; None for other cameras.
-        side: the image that ``found`` comes from: left or right (``Extracted.side``).
+        side: the image that ``found`` comes from.
         sides: result of comparing the exposure of the left and the right image; None without a
             right image.
     """
@@ -47,8 +46,8 @@ class Corners(NamedTuple):
 
 class FrameImages:
     """The images of a frame, and their features. The second image (right image or depth image) is
-    read only when it is first needed. Features are also extracted only when they are first needed.
-    A frame that is tracked by patches needs neither.
+    read, and the features are extracted, only when they are first needed. A frame that is tracked
+    by patches needs neither.
 
     Attributes:
         left: ``(H, W)`` uint8.
@@ -69,15 +68,10 @@ class FrameImages:
         image_map: ImageMap = map,
         mask: Mask | None = None,
     ) -> None:
-        """
-        Args:
-            left: ``(H, W)`` uint8.
-            read_second: function that returns the right image or the depth image, or None if there
-                is no second image. It raises UnreadableImageError if the image cannot be read.
-            image_map: applies a function to both images, sequentially or in parallel. Both ways
-                give the same result.
-            mask: the mask of the left image; None uses all pixels.
-        """
+        """Args:
+        read_second: function that returns the right image or the depth image, or None if there
+            is no second image. It raises UnreadableImageError if the image cannot be read.
+        image_map: applies a function to both images, sequentially or in parallel."""
         self.left = left
         self.mask = mask
         self.pyramid: Pyramid | None = None
@@ -154,9 +148,8 @@ def find_corners(
         left: ``(H, W)`` uint8.
         second: ``(H, W)`` uint8 right image, or float32 depth image of an RGB-D camera in metres;
             None if there is only the left image.
-        mask: the mask of the image whose features are tracked: the left image, or the right image
-            if the left one is black. Stereo matching needs no mask of the right image, because
-            masked pixels of the left image have no features to match.
+        mask: the mask of the image whose features are tracked. Stereo matching needs no mask of the
+            right image, because masked pixels of the left image have no features to match.
         pyramid: the pyramid of the left image, if it has already been built.
     """
     camera, config = context.camera, context.config

@@ -16,8 +16,7 @@ from vslam.geometry import Matrix, inverse
 
 
 class FeatureSource(Protocol):
-    """The images of a frame. Features are extracted from the images when the features are first
-    needed.
+    """The images of a frame, whose features are extracted when they are first needed.
 
     Attributes:
         extracted: the features of the frame.
@@ -51,20 +50,17 @@ class Frame:
     camera in both cases.
 
     Attributes:
-        index: number of the frame in the run, from 0.
+        index: index of the frame in the run.
         timestamp: seconds.
         image: ``(H, W)`` uint8 image of the camera, for loop detectors that need it. None before
             ``extract`` is called, or if the frame has no image.
-        features, grid: the N features of the image, and a grid in which features can be searched by
-            position. Before features are extracted, ``features`` has one entry for each landmark
-            whose image patch was found.
-        pyramid, row_offset, side: see the class ``Extracted``.
-        T_camera_left: ``(4, 4)`` transform from the left camera to "the camera". It is the identity
-            if the features come from the left image, and ``Camera.T_right_left`` if they come from
-            the right image.
+        features, grid: the N features of the image, and a grid to search them by position. Before
+            features are extracted, ``features`` has one entry for each landmark whose image patch
+            was found.
+        pyramid, row_offset, side: see ``Extracted``.
+        T_camera_left: ``(4, 4)`` transform from the left camera to "the camera".
         T_cw: ``(4, 4)`` estimated pose of the left camera (world to camera).
-        landmark: ``(N,)`` int32, id of the landmark that each feature tracks, or -1 if it tracks
-            none.
+        landmark: ``(N,)`` int32, id of the landmark that each feature tracks, or -1.
         xyz: ``(N, 3)`` float64 position of the landmark that each feature tracks, in the world
             frame, in metres; NaN if the feature tracks none.
         disparity_offset: offset that has been added to every disparity, in pixels
@@ -111,9 +107,8 @@ class Frame:
         timestamp: float = 0.0,
         image: NDArray[np.uint8] | None = None,
     ) -> Frame:
-        """Create a frame that is not tracked yet. The pose of the frame is the identity, and its
-        features have no matches.
-        """
+        """Create a frame that is not tracked yet. Its pose is the identity, and its features have
+        no matches."""
         features, n = extracted.features, len(extracted.features)
         return cls(
             index=index,
@@ -167,7 +162,7 @@ class Frame:
         return replace(self, landmark=self.landmark.copy(), xyz=self.xyz.copy())
 
     def restore(self, snapshot: Frame) -> None:
-        """Restore the pose and the matches that the frame had when ``snapshot`` made this copy."""
+        """Restore the pose and the matches of a ``snapshot``."""
         vars(self).update(vars(snapshot))
 
     def set_camera_pose(self, T_camera_w: Matrix) -> None:
@@ -176,21 +171,19 @@ class Frame:
 
     @property
     def can_become_keyframe(self) -> bool:
-        """Whether the frame can become a keyframe. A frame cannot become a keyframe if its features
-        come from the right image. This happens when the left image is black.
-        """
+        """Whether the frame can become a keyframe. It cannot if its features come from the right
+        image, because the left image is black."""
         return self.side == Side.LEFT
 
     @property
     def aligned(self) -> NDArray[np.bool_]:
-        """``(N,)`` bool: True for features whose match was aligned with sub-pixel accuracy."""
+        """``(N,)`` bool, True for features whose match was aligned with sub-pixel accuracy."""
         if self.shift is None:
             return np.zeros(len(self.features), np.bool_)
         return (self.landmark >= 0) & np.isfinite(self.shift[:, 0])
 
     def refined_features(self) -> Features:
-        """Return the features, moved to their aligned positions where their matches were aligned.
-        Disparities are unchanged."""
+        """Return the features, moved to their aligned positions. Disparities are unchanged."""
         aligned = self.aligned
         if self.shift is None or not aligned.any():
             return self.features
@@ -201,8 +194,7 @@ class Frame:
 
     @property
     def n_stereo(self) -> int:
-        """Number of features with a stereo match. In an RGB-D frame, it is the number of features
-        with a depth."""
+        """Number of features with a stereo match, or with a depth in an RGB-D frame."""
         return int(np.count_nonzero(np.isfinite(self.features.u_right)))
 
 

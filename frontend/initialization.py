@@ -39,12 +39,11 @@ class TwoViewModel:
     """The model that explains the N matches of two views: a homography or a fundamental matrix.
 
     Attributes:
-        kind: the model that was selected.
         matrix: ``(3, 3)``. A homography maps pixels of view 1 to pixels of view 2. A fundamental
             matrix maps pixels of view 1 to epipolar lines in view 2.
         inlier: ``(N,)`` bool, True for matches that the model explains.
-        homography_share: ``S_H / (S_H + S_F)``, where S_H is the score of the homography and S_F is
-            the score of the fundamental matrix. The model was selected by this ratio.
+        homography_share: ``S_H / (S_H + S_F)``, where S_H and S_F are the scores of the homography
+            and of the fundamental matrix. The model was selected by this ratio.
     """
 
     kind: Literal["homography", "fundamental"]
@@ -59,7 +58,7 @@ class TwoViews:
 
     Attributes:
         T_2_1: ``(4, 4)`` transform from camera 1 to camera 2; its translation has length 1.
-        match: ``(M,)`` int64, indices of the triangulated matches among all matches of the two
+        match: ``(M,)`` int64 indices of the triangulated matches among all matches of the two
             views.
         points: ``(M, 3)`` triangulated points, in the frame of camera 1. The unit of length is the
             distance between the two cameras.
@@ -74,7 +73,7 @@ def match_views(
     one: Frame, two: Frame, context: TrackingContext
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Match the features of two frames by their descriptors. Each feature of frame ``one`` is
-    searched for in frame ``two``, in a window around its position in ``one``.
+    searched for in a window around the same position in frame ``two``.
 
     Returns:
         ``(N,)`` indices of the matched features in ``one``, and ``(N,)`` indices in ``two``.
@@ -115,8 +114,7 @@ def reconstruct(
 
     Args:
         xy_1, xy_2: ``(N, 2)`` matched pixels.
-        sigma: ``(N,)`` standard deviation of the matched pixels, pixels.
-        seed: seed of the random samples; the same seed gives the same result.
+        sigma: ``(N,)`` standard deviation of these positions, pixels.
     """
     if len(xy_1) < SAMPLE:
         return None
@@ -150,13 +148,12 @@ def reconstruct(
 def select_model(
     xy_1: Matrix, xy_2: Matrix, sigma: Matrix, config: InitializationConfig, *, seed: int
 ) -> TwoViewModel:
-    """Fit a homography and a fundamental matrix to the matches, and select one of the models by
-    their scores (section IV of the ORB-SLAM paper, steps 2 and 3).
+    """Fit a homography and a fundamental matrix to the matches, and select one of them by its score
+    (ORB-SLAM paper, section IV, steps 2 and 3).
 
     Args:
         xy_1, xy_2: ``(N, 2)`` matched pixels, N at least 8.
-        sigma: ``(N,)`` standard deviation of the matched pixels, pixels.
-        seed: seed of the random samples.
+        sigma: ``(N,)`` standard deviation of these positions, pixels.
     """
     n = len(xy_1)
     x_1, N_1 = normalised(xy_1)
@@ -231,8 +228,8 @@ def fit_fundamentals(x_1: Matrix, x_2: Matrix) -> Matrix:
 
 
 def _null_vectors(A: Matrix) -> Matrix:
-    """For each of B matrices A, find the unit vector h that minimises ``|A h|``. Each h is reshaped
-    to a 3x3 matrix, so the result has shape ``(B, 3, 3)``."""
+    """For each of B matrices A, find the unit vector h that minimises ``|A h|``. Returns ``(B, 3,
+    3)``, each h reshaped to a 3x3 matrix."""
     _, vectors = np.linalg.eigh(A.swapaxes(1, 2) @ A)
     return vectors[:, :, 0].reshape(-1, 3, 3)
 
@@ -251,12 +248,12 @@ def score_homographies(
 def score_fundamentals(
     F: Matrix, xy_1: Matrix, xy_2: Matrix, sigma: Matrix
 ) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Score B fundamental matrices by the distances from the epipolar lines in both views. Returns
-    ``(B,)`` scores and a ``(B, N)`` bool mask of the inliers.
+    """Score B fundamental matrices by the distances from the epipolar lines in both views (section
+    IV of the ORB-SLAM paper). Returns ``(B,)`` scores and a ``(B, N)`` bool mask of the inliers.
 
-    The distance from a line has one degree of freedom, so the inlier threshold is ``CHI2_LINE``. A
-    perfect match has the same score as with a homography, so that the scores of both models can be
-    compared (section IV of the ORB-SLAM paper).
+    The inlier threshold is ``CHI2_LINE``, because the distance from a line has one degree of
+    freedom. A perfect match has the same score as with a homography, so that the scores of both
+    models can be compared.
     """
     one = np.ones((len(xy_1), 1))
     p_1, p_2 = np.hstack([xy_1, one]), np.hstack([xy_2, one])
@@ -270,8 +267,8 @@ def score_fundamentals(
 
 
 def _score(error_1: Matrix, error_2: Matrix, limit: float) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Compute ``(B,)`` scores and a ``(B, N)`` bool mask of the inliers for B models. The arguments
-    are the ``(B, N)`` chi-square errors in view 1 and in view 2, and the inlier threshold."""
+    """Compute ``(B,)`` scores and a ``(B, N)`` bool mask of the inliers from the ``(B, N)``
+    chi-square errors of B models in both views."""
     score = np.zeros(len(error_1))
     for error in (error_2, error_1):
         score += np.where(error < limit, CHI2_MONO - error, 0.0).sum(axis=1)
@@ -284,8 +281,8 @@ def _transferred(H: Matrix, xy: Matrix) -> Matrix:
 
 
 def _adjugates(H: Matrix) -> Matrix:
-    """Compute the adjugates of ``(B, 3, 3)`` matrices. An adjugate is the inverse up to scale. It
-    exists even for a singular matrix."""
+    """Compute the adjugates of ``(B, 3, 3)`` matrices: their inverses up to scale, which exist even
+    for singular matrices."""
     a, b, c = H[:, 0], H[:, 1], H[:, 2]
     return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
 
@@ -307,7 +304,7 @@ def motions_of_essential(E: Matrix) -> list[Matrix]:
 def motions_of_homography(A: Matrix) -> list[Matrix]:
     """Return the eight candidate motions ``T_2_1`` of a calibrated homography (Faugeras and
     Lustman, "Motion and structure from motion in a piecewise planar environment", 1988). The list
-    is empty for a pure rotation."""
+    is empty if two singular values are equal, for example for a pure rotation."""
     U, (d1, d2, d3), Vt = np.linalg.svd(A)
     if d1 / d2 < 1.00001 or d2 / d3 < 1.00001:
         return []
@@ -345,9 +342,8 @@ def _triangulate(
     """Triangulate N matches.
 
     Returns:
-        ``(N, 3)`` points in the frame of camera 1; ``(N,)`` bool, True for points that lie in front
-        of both cameras and have small reprojection errors; ``(N,)`` cosine of the parallax angle of
-        each point.
+        ``(N, 3)`` points in the frame of camera 1; ``(N,)`` bool, True for points in front of both
+        cameras with small reprojection errors; ``(N,)`` cosine of the parallax angle of each point.
     """
     R, t = T_2_1[:3, :3], T_2_1[:3, 3]
     ray_1 = camera.backproject(xy_1, np.ones(len(xy_1)))

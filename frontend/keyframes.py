@@ -1,5 +1,5 @@
-"""Decides when a frame becomes a keyframe. The rules follow section III-E of the ORB-SLAM2 paper.
-For monocular cameras, they follow section V-E of the ORB-SLAM paper."""
+"""Decides when a frame becomes a keyframe, following section III-E of the ORB-SLAM2 paper. For
+monocular cameras, the rules follow section V-E of the ORB-SLAM paper."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from vslam.states import PolicyState
 
 @dataclass(frozen=True)
 class KeyframeEvidence:
-    """The quantities that a keyframe decision depends on.
+    """The quantities that a keyframe decision depends on. Close points have a depth that stereo
+    measures accurately.
 
     Attributes:
         seconds_since_keyframe: time since the last keyframe, seconds.
         n_inliers: number of landmarks that this frame tracks.
         n_reference: number of landmarks of the reference keyframe that enough keyframes observe
             (``MapView.n_reference``).
-        tracked_close: number of close stereo features of this frame that track a landmark. A close
-            feature has a depth that stereo measures accurately.
+        tracked_close: number of close stereo features of this frame that track a landmark.
         untracked_close: number of close stereo features that track no landmark. None for a frame
             that was tracked by patches and has no features; the number is then assumed to be large
             enough.
@@ -49,8 +49,8 @@ class KeyframeEvidence:
     close_ratio: float = 1.0
 
     def ahead(self, frames: int) -> KeyframeEvidence:
-        """Predict the evidence some frames later. It is assumed that the number of tracked close
-        points continues to change by the factor ``close_ratio`` per frame."""
+        """Predict the evidence some frames later, if the number of tracked close points continues
+        to change by the factor ``close_ratio`` per frame."""
         close = round(self.tracked_close * self.close_ratio**frames)
         n_inliers = self.n_inliers + close - self.tracked_close
         return replace(self, tracked_close=close, n_inliers=n_inliers)
@@ -61,25 +61,20 @@ def needs_keyframe(
 ) -> bool:
     """Return whether a stereo or RGB-D frame should become a keyframe.
 
-    A keyframe is needed if the last keyframe is old. A keyframe is also needed if the view has
-    changed enough, or if too few close points are tracked. For these last two reasons, a keyframe
-    is made only if local mapping is idle or the need is urgent.
+    There are three reasons: the last keyframe is old, the view has changed enough, or too few close
+    points are tracked. For the last two reasons, a keyframe is made only if local mapping is idle
+    or the need is urgent.
 
-    A lack of close points is a reason for a keyframe only if a new keyframe would provide more
-    close points. On a motorway, close points are scarce and leave the view before they are seen
-    twice. Even the first frame after a keyframe then tracks too few close points. In that case, a
-    lower threshold applies: a fraction of the number of close points that such a first frame tracks
-    on average (``gained_close``).
-
-    The lower threshold applies only if enough far points constrain the pose. Their number must be
-    at least the usual threshold for close points. In fog there are no far points, so the usual
-    threshold remains.
+    A lack of close points counts only if a new keyframe would provide more of them. On a motorway,
+    even the first frame after a keyframe tracks too few close points. In that case, a lower
+    threshold applies: a fraction of the number that such a first frame tracks on average
+    (``gained_close``). The lower threshold applies only if enough far points constrain the pose. In
+    fog, there are no far points.
 
     Args:
-        depth: whether the camera is RGB-D. Such a camera maps nearly all points at once, because
-            they are close, so the counts alone would lead to too few keyframes. A hand-held camera
-            needs more keyframes, because it turns faster than a car. Therefore, the maximum time
-            between keyframes is shorter for RGB-D.
+        depth: whether the camera is RGB-D. The maximum time between keyframes is then shorter,
+            because the counts alone would lead to too few keyframes: nearly all points are close
+            and are mapped at once.
     """
     max_interval_s = config.depth_max_interval_s if depth else config.max_interval_s
     required: float = config.min_tracked_close
@@ -102,14 +97,13 @@ def needs_keyframe(
 
 
 def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig) -> bool:
-    """Return whether a monocular frame should become a keyframe. The rule follows section V-E of
-    the ORB-SLAM paper.
+    """Return whether a monocular frame should become a keyframe (section V-E of the ORB-SLAM
+    paper).
 
     Keyframes are made early, because a point can be mapped only after two keyframes have seen it
-    from different positions. Redundant keyframes are culled later.
-
-    The time since the last keyframe is not a reason by itself. While the camera stands still,
-    nothing new can be triangulated.
+    from different positions. Redundant keyframes are culled later. The time since the last keyframe
+    is not a reason by itself, because nothing new can be triangulated while the camera stands
+    still.
     """
     tracked, reference = evidence.n_inliers, evidence.n_reference
     if tracked >= config.monocular_ratio * reference:
@@ -124,14 +118,15 @@ def count_close(
     state: PolicyState, tracked_close: int, frame: int, config: KeyframeConfig
 ) -> PolicyState:
     """Update the running mean of the number of close points that the first frame after a keyframe
-    tracks. Returns the new state.
+    tracks. Returns the new state, which is unchanged if this frame is not the first after a
+    keyframe.
 
-    ``tracked_close`` is the number of close points that the frame with index ``frame`` tracks. The
-    state changes only if this frame is the first frame after a keyframe.
+    A single frame may track few close points by chance. Therefore, the mean is an exponential
+    moving average that starts at a high value.
 
-    A single frame may track few close points by chance. Close points are scarce only if several
-    frames in a row track few close points. Therefore, the running mean is an exponential moving
-    average. It starts at a high value.
+    Args:
+        tracked_close: number of close points that the frame tracks.
+        frame: index of the frame.
     """
     if not state.gain_awaited:
         return state
@@ -141,10 +136,11 @@ def count_close(
 
 def close_ratio(state: PolicyState, tracked_close: int, frame: int) -> float:
     """Compute the factor by which the number of tracked close points has changed per frame since
-    the first frame after the last keyframe.
+    the first frame after the last keyframe. It is 1 if the number has not fallen.
 
-    ``tracked_close`` is the number of close points that the current frame, which has the index
-    ``frame``, tracks. The result is 1 if the number has not fallen.
+    Args:
+        tracked_close: number of close points that the current frame tracks.
+        frame: index of the current frame.
     """
     if not 0 < tracked_close < state.first_close:
         return 1.0
@@ -194,8 +190,8 @@ class KeyframePolicy:
         )
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:
-        """Return whether the frame should become a keyframe. This method does not test whether the
-        place is already mapped. ``is_known`` tests this."""
+        """Return whether the frame should become a keyframe. The method ``is_known`` tests whether
+        the place is already mapped."""
         camera = self._context.camera
         if camera.monocular:
             return needs_monocular_keyframe(evidence, self._config)
@@ -207,15 +203,11 @@ class KeyframePolicy:
 
         Two conditions must hold. The frame must track as many landmarks as is expected of a frame
         next to the old keyframe. It must also share enough of these landmarks with the old
-        keyframe.
+        keyframe. A lack of close points is not a reason to map a known place again.
 
-        A lack of close points is not a reason to map a known place again, because the old keyframe
-        did not provide more close points.
-
-        In addition, the frame must have a minimum number of inliers. Otherwise, no keyframe would
-        be made when the camera moves beyond the end of a map. The last keyframe of a map has few
-        landmarks that at least three keyframes observe, so both conditions would hold until
-        tracking is lost.
+        In addition, the frame must have a minimum number of inliers. The last keyframe of a map has
+        few landmarks that at least three keyframes observe. Without the minimum, no keyframe would
+        be made when the camera moves beyond the end of the map.
 
         Args:
             n_inliers: number of landmarks that the frame tracks.
@@ -233,8 +225,8 @@ class KeyframePolicy:
     def is_due(self, index: int, evidence: KeyframeEvidence) -> bool:
         """Return whether a frame that was tracked by patches must now become a keyframe as planned.
 
-        A keyframe is planned a few frames before it is expected to be needed. The features of the
-        planned keyframe can then be extracted in the background.
+        A keyframe is planned a few frames before it is expected to be needed, so that its features
+        can be extracted in the background.
         """
         if self.due < 0:
             soon = range(self._config.patch_lead_frames + 1)
@@ -246,13 +238,10 @@ class KeyframePolicy:
         return True
 
     def keyframe_made(self) -> None:
-        """Update the state after a frame became a keyframe."""
         self._state = replace(self._state, gain_awaited=True, due=-1)
 
     def state(self) -> PolicyState:
-        """Return the state of the policy, to store it in a map file or a checkpoint."""
         return self._state
 
     def restore(self, state: PolicyState) -> None:
-        """Restore a state that the method ``state`` returned."""
         self._state = state

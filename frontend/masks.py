@@ -27,7 +27,7 @@ class Mask:
 
     Attributes:
         used: ``(H, W)`` bool, False for pixels that are not to be used.
-        levels: pyramid of the mask. A pixel is 1 if a feature may lie there, else 0.
+        levels: mask pyramid, 1 for pixels where a feature may lie and 0 elsewhere.
     """
 
     used: NDArray[np.bool_]
@@ -35,8 +35,7 @@ class Mask:
 
     @classmethod
     def of(cls, mask: NDArray[np.uint8] | NDArray[np.bool_], config: OrbConfig) -> Self:
-        """Create a mask from an ``(H, W)`` array. Pixels whose value is 0 in the array are not to
-        be used."""
+        """Create a mask from an ``(H, W)`` array that is 0 for pixels that are not to be used."""
         used = mask > 0
         levels = build_pyramid(used * np.uint8(255), config)
         for index in range(config.n_levels):
@@ -47,9 +46,11 @@ class Mask:
     def shows(self, xy: NDArray[np.floating], octave: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Return ``(N,)`` bool, True for features that the mask allows.
 
-        ``xy`` contains the ``(N, 2)`` positions of the features, in full-resolution pixels.
-        ``octave`` contains their ``(N,)`` pyramid levels. Positions outside the image are clamped
-        to the border of the image.
+        Positions outside the image are clamped to its border.
+
+        Args:
+            xy: ``(N, 2)`` positions in full-resolution pixels.
+            octave: ``(N,)`` pyramid levels.
         """
         shapes = self.levels.shapes[octave]
         ratio = self.levels.shapes[0, ::-1] / shapes[:, ::-1]
@@ -59,7 +60,7 @@ class Mask:
         return self.levels.pixels[at] > 0
 
     def filled(self, image: Image) -> Image:
-        """Copy an ``(H, W)`` uint8 image and give all masked pixels the mean grey value of the
+        """Copy an ``(H, W)`` uint8 image, and give all masked pixels the mean grey value of the
         other pixels. The copy is for networks that read the whole image."""
         mean = np.uint8(image[self.used].mean()) if self.used.any() else np.uint8(0)
         return np.where(self.used, image, mean)

@@ -1,8 +1,8 @@
 """Matches landmarks and descriptors with the features of a frame.
 
 The search by projection follows ORB-SLAM (Mur-Artal et al., T-RO 2015, sections V-C and V-D). A
-landmark is searched for only near its projection, and only near the pyramid level at which it
-should appear.
+landmark is searched for only near its projection and near the pyramid level at which it should
+appear.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def predict_view(T, xyz, normal, distance_range, intrinsics, width, height, scal
 
     A landmark is visible if it meets three conditions. It projects into the image. Its distance
     from the camera is in ``distance_range``, with a tolerance of 20 %. The angle between the
-    viewing ray and the mean viewing direction of the landmark is at most 60 degrees.
+    viewing ray and its mean viewing direction is at most 60 degrees.
 
     Args:
         T: ``(4, 4)`` pose of the camera (world to camera).
@@ -82,7 +82,7 @@ class Projections(NamedTuple):
 
     Attributes:
         uvr: ``(M, 3)`` predicted u, v, u_right, pixels.
-        radius: ``(M,)`` half width of the search window, pixels; landmarks with a radius of 0 are
+        radius: ``(M,)`` half width of the search window, pixels. Landmarks with radius 0 are
             skipped.
         octave_low, octave_high: ``(M,)`` lowest and highest accepted octave.
         descriptor: ``(M, 4)``, the 32 bytes of each descriptor as four integers.
@@ -96,12 +96,12 @@ class Projections(NamedTuple):
 
 
 class Searchable(NamedTuple):
-    """N features of an image, and a grid in which the features can be searched by position.
+    """N features of an image, and a grid to search them by position.
 
     Attributes:
         xy: ``(N, 2)`` pixels.
         octave: ``(N,)`` pyramid level.
-        u_right: ``(N,)`` columns in the right image, NaN for features without a stereo match.
+        u_right: ``(N,)`` columns in the right image, NaN without a stereo match.
         descriptor: ``(N, 4)``, the 32 bytes of each descriptor as four integers.
         grid: the features sorted by image cell.
     """
@@ -114,14 +114,15 @@ class Searchable(NamedTuple):
 
     @classmethod
     def of_features(cls, features: Features, grid: FeatureGrid) -> Searchable:
-        """Create a ``Searchable`` from the features of a frame. The arrays are not copied."""
+        """Create a ``Searchable`` without copying the arrays."""
         descriptor = features.descriptors.view(np.uint64)
         return cls(features.xy, features.octave, features.u_right, descriptor, grid)
 
 
 @kernel
 def search_windows(projections, features, free, max_distance, ratio):
-    """Find the best feature for each of M projected landmarks.
+    """Find the best feature for each of M projected landmarks. A feature is matched at most once,
+    with the landmark that has the closest descriptor.
 
     Args:
         projections: the ``Projections`` of the M landmarks.
@@ -132,9 +133,8 @@ def search_windows(projections, features, free, max_distance, ratio):
             both features have the same octave; 1 disables the test.
 
     Returns:
-        ``(M,)`` int32 index of the feature that each landmark is matched with, or -1 if it has no
-        match; ``(M,)`` int32 distances between the descriptors. A feature is matched at most once,
-        with the landmark that has the closest descriptor.
+        ``(M,)`` int32 index of the matched feature of each landmark, or -1; ``(M,)`` int32
+        distances between the descriptors.
     """
     uvr, radius, octave_low, octave_high, descriptors = projections
     xy, octave, u_right, frame_descriptors, grid = features
@@ -199,8 +199,7 @@ def search_all(a, b, max_distance, ratio):
         ratio: largest ratio of the best to the second best distance, for each descriptor of a.
 
     Returns:
-        ``(M,)`` int32: for each descriptor of a, the index of its match in b, or -1 if it has no
-        match.
+        ``(M,)`` int32 index in b of the match of each descriptor of a, or -1.
     """
     m, n = len(a), len(b)
     best_of_a = np.full(m, -1, np.int32)
@@ -230,10 +229,9 @@ def consistent_orientation(angle_a, angle_b):
     """Test whether the rotation of each match agrees with the rotations of most other matches
     (section V-C of the ORB-SLAM paper).
 
-    The rotation of a match is the difference between the orientations of its two features. The
-    rotations are counted in a histogram of 30 bins. Matches in the three fullest bins are
-    consistent. The second and the third bin count only if each holds at least a tenth as many
-    matches as the first.
+    The rotation of a match is the difference between the orientations of its two features. Matches
+    in the three fullest bins of a histogram of the rotations are consistent. The second and the
+    third bin count only if each holds at least a tenth as many matches as the first.
 
     Args:
         angle_a, angle_b: ``(N,)`` float32 orientations of the matched features, radians.
@@ -261,12 +259,11 @@ def consistent_orientation(angle_a, angle_b):
 
 
 def count_elsewhere(u: NDArray[np.floating], width: int) -> int:
-    """Count the inliers outside a vertical strip of the image. The width of the strip is a third of
-    the width of the image. The strip is placed where it contains as many inliers as possible.
+    """Count the inliers outside the vertical strip that contains the most inliers. The strip is a
+    third of the image wide.
 
     Two different places may contain a similar object, for example a facade or a parked car. Such an
-    object can provide a hundred inliers and determine a pose to a centimetre. However, all these
-    inliers lie close together, because the rest of the scene does not match. At a true revisit, the
+    object can provide a hundred inliers, but all of them lie close together. At a true revisit, the
     inliers are spread over the whole image.
 
     Args:

@@ -46,13 +46,12 @@ class Extraction:
     pyramid: Pyramid
 
     def joined(self, other: Extraction) -> tuple[Extraction, NDArray[np.int64]]:
-        """Join these features with the features of another extraction from the same image. The
-        joined features are sorted by octave again.
+        """Join these features with other features that were extracted from the same image.
 
         Returns:
-            The joined features, and the ``(N,)`` indices that sorted them. To sort another array in
-            the same way, concatenate its values for these features and for ``other``, in this
-            order, and index the result with the ``(N,)`` indices.
+            The joined features, sorted by octave, and the ``(N,)`` order that sorted them. To sort
+            another array in the same way, concatenate its values for these features and for
+            ``other``, and index the result with this order.
         """
         octave = np.concatenate([self.octave, other.octave])
         order = np.argsort(octave, kind="stable")
@@ -74,11 +73,8 @@ def extract(
 ) -> Extraction:
     """Extract up to ``config.n_features`` ORB features from an ``(H, W)`` uint8 image.
 
-    The function has no side effects. It can be called from several threads at the same time.
-
     Args:
-        allowed: pyramid that is 1 for pixels where a corner may lie, and 0 for other pixels; None
-            allows all pixels.
+        allowed: mask pyramid, 1 where a corner may lie and 0 elsewhere; None allows all pixels.
         pyramid: the pyramid of the image, if it has already been built.
     """
     pyramid = pyramid or build_pyramid(image, config)
@@ -98,8 +94,8 @@ def extract(
 
 
 def extract_at(found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.uint8]) -> Extraction:
-    """Extract features at N given positions. A position is skipped if another feature lies within
-    ``KEYPOINT_REACH`` of it.
+    """Extract features at N given positions. Positions near the border of the image or near an
+    existing feature are skipped.
 
     Args:
         found: the features that were already extracted from the image.
@@ -130,8 +126,8 @@ def extract_at(found: Extraction, xy: NDArray[np.float32], octave: NDArray[np.ui
 
 @kernel
 def _is_free(pixel, existing):
-    """Return ``(N,)`` bool, True for pixels that are far from all existing features. ``pixel`` has
-    shape ``(N, 2)``, and ``existing`` has shape ``(M, 2)``."""
+    """Return ``(N,)`` bool, True for ``(N, 2)`` pixels that are far from all ``(M, 2)`` existing
+    features."""
     free = np.ones(len(pixel), np.bool_)
     for i in range(len(pixel)):
         x, y = pixel[i, 0], pixel[i, 1]
@@ -144,14 +140,14 @@ def _is_free(pixel, existing):
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
-    """Return the ``(L,)`` float64 scale of each pyramid level, in full-resolution pixels per pixel
-    of the level. The scale of level 0 is 1."""
+    """Return the ``(L,)`` scales of the pyramid levels: full-resolution pixels per pixel of the
+    level."""
     return config.scale_factor ** np.arange(config.n_levels, dtype=np.float64)
 
 
 @cache
 def features_per_level(config: OrbConfig) -> NDArray[np.int64]:
-    """Return the ``(L,)`` int64 maximum number of features of each pyramid level. ``n_features`` is
+    """Return the ``(L,)`` maximum number of features of each pyramid level. ``n_features`` is
     divided among the levels in proportion to 1 / scale (section V-A of the ORB-SLAM paper)."""
     weights = 1.0 / scale_factors(config)
     share = config.n_features * weights / weights.sum()
@@ -175,8 +171,8 @@ def _layout(
 
 
 def level_shapes(size: tuple[int, int], config: OrbConfig) -> NDArray[np.int64]:
-    """Return the ``(L, 2)`` heights and widths of the pyramid levels of an image. ``size`` is the
-    height and width of the image."""
+    """Return the ``(L, 2)`` heights and widths of the pyramid levels of an image with the given
+    height and width."""
     return _layout(*size, config)[2]
 
 
@@ -202,18 +198,18 @@ def extract_levels(
 ):
     """Extract the ORB features of all pyramid levels of an image.
 
-    All levels are processed in a single kernel, so that the global interpreter lock is acquired
-    only once per image.
+    A single kernel processes all levels, so that the global interpreter lock is acquired only once
+    per image.
 
     Args:
         pixels, offsets, shapes: fields of the ``Pyramid`` of the image.
-        allowed: pixels of a pyramid of the same shapes, 1 where a corner may lie and 0 elsewhere;
-            an empty array allows all pixels.
-        quota: ``(L,)`` int64, greatest number of features per level.
+        allowed: pixels of a mask pyramid of the same shapes, 1 where a corner may lie and 0
+            elsewhere; an empty array allows all pixels.
+        quota: ``(L,)`` int64 maximum number of features of each level.
         threshold, threshold_min, cell: see ``local_maxima``.
-        inside: ``DISC``, the disc that ``orientations`` uses.
+        inside: ``DISC``, the mask of the disc for the orientation.
         pattern: ``PATTERN``, ``(256, 4)`` int8 coordinates xa, ya, xb, yb of the two points of each
-            test.
+            BRIEF test.
 
     Returns:
         ``xy``, ``octave``, ``angle`` and ``descriptors``, see ``vslam.features.Features``.
@@ -247,8 +243,11 @@ def extract_levels(
 @kernel
 def detect_corners(pixels, allowed, quota, threshold, threshold_min, cell):
     """Detect up to ``quota`` FAST-9 corners in one pyramid level. The corners are evenly spread
-    over the ``allowed`` pixels. Returns their ``(n, 2)`` float32 x and y, in pixels of the
-    level."""
+    over the ``allowed`` pixels.
+
+    Returns:
+        ``(n, 2)`` float32 positions x, y, in pixels of the level.
+    """
     height, width = pixels.shape
     if min(height, width) <= 2 * MARGIN or quota == 0:
         return np.empty((0, 2), np.float32)
@@ -278,9 +277,8 @@ DISC = disc(PATCH_RADIUS)
 
 @kernel
 def orientations(pixels, corners, inside):
-    """Compute the ``(n,)`` float32 orientation of each corner, in radians. It is the direction from
-    the corner to the intensity centroid of the disc around the corner (Rublee et al., section
-    3.2)."""
+    """Compute the ``(n,)`` float32 orientation of each corner, in radians: the direction from the
+    corner to the intensity centroid of the disc around it (Rublee et al., section 3.2)."""
     n = len(corners)
     angles = np.empty(n, np.float32)
     height, width = pixels.shape
@@ -345,18 +343,12 @@ def describe(smooth, corners, angles, pattern):
 
 @kernel
 def smoothed(pixels):
-    """Blur an image. BRIEF descriptors are computed from the blurred image.
+    """Blur an ``(H, W)`` uint8 image of at least 4x4 pixels, for BRIEF. The result is identical to
+    that of ``cv2.GaussianBlur`` with a 7x7 kernel and a sigma of 2.
 
-    The result is identical to that of ``cv2.GaussianBlur`` with a 7x7 kernel and a sigma of 2.
-    Borders are mirrored.
-
-    OpenCV uses fixed-point weights in multiples of 1/256. It blurs first along rows, then along
-    columns, and rounds once at the end. Here each row sum is split into whole grey levels and
-    256ths, and the two parts are summed separately along the columns. Every intermediate sum then
-    fits into 16 bits, so a vector register holds twice as many pixels as with 32 bits.
-
-    Args:
-        pixels: ``(H, W)`` uint8 image of at least 4x4 pixels.
+    OpenCV uses weights in multiples of 1/256, and rounds once at the end. Here, row sums are split
+    into whole grey levels and 256ths. Every intermediate sum then fits into 16 bits, so a vector
+    register holds twice as many pixels as with 32 bits.
     """
     height, width = pixels.shape
     taps = 2 * BLUR_REACH + 1
@@ -399,11 +391,7 @@ def smoothed(pixels):
 
 @inner_kernel
 def weigh(a, b, c, d, e, f, g, out):
-    """Write the weighted sum of seven image rows, or of seven shifted copies of one row, into
-    ``out``.
-
-    The weights of the seven rows are samples of a Gaussian with a sigma of 2, in 256ths. They are
-    rounded to a sum of 256, as in OpenCV.
-    """
+    """Write the weighted sum of seven rows into ``out``. The weights are samples of a Gaussian with
+    a sigma of 2, in 256ths. They are rounded to a sum of 256, as in OpenCV."""
     for x in range(np.uintp(len(out))):
         out[x] = 18 * (a[x] + g[x]) + 34 * (b[x] + f[x]) + 48 * (c[x] + e[x]) + 56 * d[x]

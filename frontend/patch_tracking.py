@@ -1,4 +1,5 @@
-"""Tracks a frame without extracting features: it searches the image for image patches of landmarks.
+"""Tracks a frame without extracting features, by searching the image for image patches of
+landmarks.
 
 The patches come from the newest keyframes. The method follows SVO (Forster et al., ICRA 2014,
 section III, and T-RO 2017). First, sparse image alignment to the last frame estimates the pose
@@ -25,8 +26,8 @@ _MARGIN = PATCH_RADIUS + 2  # least distance of a patch centre from the border o
 
 
 class PatchTrack(NamedTuple):
-    """The result of tracking a frame by image patches: its pose, and the N landmarks that are
-    inliers of the pose optimisation.
+    """The result of tracking a frame by image patches. N landmarks are inliers of the pose
+    optimisation.
 
     Attributes:
         T_cw: ``(4, 4)`` pose (world to camera).
@@ -61,10 +62,9 @@ def track_patches(
     pose.
 
     Args:
-        pyramid: the pyramid of the image.
         T_cw: ``(4, 4)`` initial pose (world to camera). Its error may shift projected landmarks by
             about two pixels.
-        mask: the mask of the image; None if all pixels are used.
+        mask: the mask of the image; None uses all pixels.
     """
     known, local = view.patches, view.with_patches
     camera, scales, config = context.camera, context.scales, context.config.alignment
@@ -107,7 +107,7 @@ def track_patches(
 def _whole_pixels(
     uv: NDArray[np.float64], pyramid: Pyramid, level: NDArray[np.uint8]
 ) -> NDArray[np.float32]:
-    """Round ``(N, 2)`` full-resolution positions to the nearest pixels of their levels."""
+    """Round ``(N, 2)`` full-resolution positions to the nearest whole pixels of their levels."""
     ratio = pyramid.shapes[0, ::-1] / pyramid.shapes[level][:, ::-1]
     pixel = np.rint((uv + 0.5) / ratio - 0.5)
     return ((pixel + 0.5) * ratio - 0.5).astype(np.float32)

@@ -1,9 +1,9 @@
 """Cuts out image patches around keypoints, and stores the patches of the newest keyframes. Matches
 are aligned to these patches with sub-pixel accuracy.
 
-The patches of the newest keyframes are kept, and older patches are discarded. The patches of older
-keyframes are rarely needed, because the newest keyframes observe nearly all landmarks that are
-being tracked. In addition, a patch takes more memory than the rest of an observation.
+Older patches are discarded. They are rarely needed, because the newest keyframes observe nearly all
+landmarks that are being tracked. In addition, a patch takes more memory than the rest of an
+observation.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def patches_around(
     Args:
         xy: ``(N, 2)`` positions in full-resolution pixels. The patches must lie inside their
             levels.
-        octave: ``(N,)`` pyramid level of each keypoint.
+        octave: ``(N,)`` pyramid levels.
 
     Returns:
         ``(N, PATCH_PIXELS)`` uint8 patches, row by row.
@@ -58,13 +58,12 @@ def _cut(pixels, offsets, shapes, xy, octave):
 
 
 class RecentPatches:
-    """Stores the image patches around the features of the newest keyframes.
+    """Stores the image patches around the features of the newest ``capacity`` keyframes.
 
-    Frames without an image pyramid, for example frames of an RGB-D camera, have no patches.
+    Frames without an image pyramid, such as RGB-D frames, have no patches.
     """
 
     def __init__(self, capacity: int) -> None:
-        """Create an empty store. It keeps the patches of up to ``capacity`` keyframes."""
         self._keyframes = np.full(capacity, -1, np.int64)  # id of the keyframe in each slot, or -1
         self._n_features = np.zeros(capacity, np.int64)
         self._pixels = np.empty((capacity, 0, PATCH_PIXELS), np.uint8)
@@ -89,8 +88,8 @@ class RecentPatches:
         self.add(KeyframePatches(keyframe, pixels, shift))
 
     def add(self, patches: KeyframePatches) -> None:
-        """Store the patches of one more keyframe. If ``capacity`` keyframes are stored, the patches
-        of the oldest one are replaced."""
+        """Store the patches of one keyframe. If the store is full, they replace the patches of the
+        oldest keyframe."""
         slot, n = self._next, len(patches.pixels)
         if n > self._shift.shape[1]:
             self._pixels = _widened(self._pixels, n)
@@ -100,8 +99,7 @@ class RecentPatches:
         self._next = (slot + 1) % len(self._keyframes)
 
     def all(self) -> tuple[KeyframePatches, ...]:
-        """Return the stored patches of all keyframes, oldest keyframe first, to save them in a
-        checkpoint."""
+        """Return the stored patches of all keyframes, oldest keyframe first."""
         slots = np.roll(np.arange(len(self._keyframes)), -self._next)
         return tuple(
             KeyframePatches(
@@ -117,8 +115,8 @@ class RecentPatches:
         """Look up the image patches of landmarks in the map.
 
         Each patch comes from the newest keyframe that observes the landmark and whose patches are
-        stored. If there is no such keyframe, the landmark is omitted. The result is valid until
-        ``add`` is called.
+        stored. A landmark without such a keyframe is omitted. The result is valid until ``add`` is
+        called.
 
         Args:
             ids: ``(L,)`` ids of the landmarks, sorted.
@@ -147,15 +145,13 @@ def _widened(array: NDArray, n: int) -> NDArray:
 
 
 def certainty_of(frame: Frame, config: AlignmentConfig) -> NDArray[np.uint8] | int:
-    """Compute the ``(N,)`` uint8 certainty of the position of each feature (``Arrays.certainty``).
-
-    The certainty is a ratio of two variances: the usual variance of a keypoint's position, divided
-    by the variance of the position of this feature. It is 1 for all features of a frame without a
-    pyramid.
+    """Compute the ``(N,)`` uint8 certainty of the position of each feature (``Arrays.certainty``):
+    the usual variance of a keypoint's position, divided by the variance of this position. It is 1
+    for all features of a frame without a pyramid.
 
     The position of an aligned match is accurate. A feature without a match is also considered
-    accurate, because a landmark that is created from it is defined by its position. The position of
-    a match that was not aligned is wrong by about half a pixel.
+    accurate, because its position defines the landmark that is created from it. The position of a
+    match that was not aligned is wrong by about half a pixel.
     """
     if frame.pyramid is None:
         return 1
@@ -171,9 +167,9 @@ def newest_rows(a, keyframes, ids):
     search therefore ends at the first observation that is older than all ``keyframes``.
 
     Returns:
-        ``(L,)`` int64 row of each observation in the observation arrays of the map, and ``(L,)``
-        int64 index into ``keyframes`` of the keyframe that made the observation. Both are -1 where
-        none of ``keyframes`` observes the landmark.
+        Two ``(L,)`` int64 arrays: the row of each observation in the observation arrays of the map,
+        and the index into ``keyframes`` of the keyframe that made the observation. Both are -1
+        where none of ``keyframes`` observes the landmark.
     """
     found, view = np.full(len(ids), -1, np.int64), np.full(len(ids), -1, np.int64)
     newest = keyframes.max()

@@ -20,7 +20,7 @@ def solve_p3p(points, rays, T_cw):
 
     Args:
         points: ``(3, 3)`` float64, one point per row, in the world frame.
-        rays: ``(3, 3)`` float64, unit directions in the camera frame.
+        rays: ``(3, 3)`` float64, one unit vector per row, in the camera frame.
         T_cw: ``(4, 4, 4)`` float64, receives the poses (world to camera).
 
     Returns:
@@ -127,8 +127,7 @@ def _dot(rays, i, j):
 
 @inner_kernel
 def _cross(points, out):
-    """Compute the normal of the triangle of three points, and write it into ``out``. The length of
-    the normal is twice the area of the triangle."""
+    """Write the normal of a triangle into ``out``. Its length is twice the area of the triangle."""
     for k in range(3):
         m, n = (k + 1) % 3, (k + 2) % 3
         out[k] = (points[1, m] - points[0, m]) * (points[2, n] - points[0, n])
@@ -146,8 +145,8 @@ def _determinant(A):
 
 @inner_kernel
 def _mixed(A, B):
-    """Compute the coefficient of g in the polynomial det(A + g B). It is the sum, over all entries
-    of B, of the entry times the corresponding cofactor of A."""
+    """Compute the coefficient of g in the polynomial det(A + g B): the sum of the entries of B
+    times the cofactors of A."""
     total = 0.0
     for i in range(3):
         for j in range(3):
@@ -158,8 +157,7 @@ def _mixed(A, B):
 
 @inner_kernel
 def _real_root(c3, c2, c1, c0):
-    """Compute a real root of ``c3 x^3 + c2 x^2 + c1 x + c0`` in closed form, and refine it by
-    Newton's method."""
+    """Compute a real root of ``c3 x^3 + c2 x^2 + c1 x + c0``."""
     b, c, d = c2 / c3, c1 / c3, c0 / c3
     shift = b / 3.0
     p = c - b * b / 3.0
@@ -188,8 +186,8 @@ def _real_root(c3, c2, c1, c0):
 
 @inner_kernel
 def _refine_depths(depth, a12, a13, a23, b12, b13, b23):
-    """Refine the depths of the three points by Newton's method. The equations are the law of
-    cosines for each pair of points (section 3.6 of the Lambda Twist paper)."""
+    """Refine the depths of the three points by Newton's method (section 3.6 of the Lambda Twist
+    paper). The equations are the law of cosines for each pair of points."""
     for _ in range(5):
         l1, l2, l3 = depth[0], depth[1], depth[2]
         r1 = l1 * l1 + l2 * l2 - 2.0 * b12 * l1 * l2 - a12
@@ -215,8 +213,8 @@ def _refine_depths(depth, a12, a13, a23, b12, b13, b23):
 
 @inner_kernel
 def _pose_of_triangle(points, rays, depth, T):
-    """Compute the pose that maps three points in the world frame to their positions on the three
-    rays, and write it into ``T``."""
+    """Write into ``T`` the pose (world to camera) that maps three points to the given depths along
+    their rays."""
     placed = np.empty((3, 3))
     for i in range(3):
         for k in range(3):
@@ -239,9 +237,8 @@ def _pose_of_triangle(points, rays, depth, T):
 
 @inner_kernel
 def _triad(points, axes):
-    """Compute an orthonormal frame of a triangle, and write its axes into the rows of ``axes``. The
-    rows are the direction of the first side, the normal, and the cross product of these two
-    vectors."""
+    """Write an orthonormal frame of a triangle into the rows of ``axes``: the direction of the
+    first side, the normal of the triangle, and the cross product of both."""
     _cross(points, axes[1])
     for k in range(3):
         axes[0, k] = points[1, k] - points[0, k]
@@ -259,7 +256,7 @@ def _score_pose(T, points, uvr, inverse_sigma2, intrinsics, to_beat, inlier):
     """Compute the MSAC score of a pose (Torr and Zisserman, CVIU 2000) and its number of inliers.
     The inliers are written into ``inlier``.
 
-    As soon as the score can no longer exceed ``to_beat``, the function stops and returns -1, 0.
+    As soon as the score can no longer exceed ``to_beat``, the function returns -1, 0.
     """
     pinhole = unpacked(intrinsics)
     n = len(points)
@@ -297,15 +294,14 @@ def ransac_pose(points, uvr, inverse_sigma2, intrinsics, seed, min_inliers, max_
             feature.
         inverse_sigma2: ``(N,)`` float64, inverse variance of u and v.
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
-        seed: uint64; the same seed gives the same result.
+        seed: uint64 seed of the random samples.
         min_inliers: least number of inliers of an acceptable pose.
-        max_draws: maximum number of samples.
-        confidence: a probability. Assume that a better pose with at least ``min_inliers`` inliers
-            exists. Sampling ends when such a pose would have been found with this probability.
+        confidence: sampling ends when a better pose with at least ``min_inliers`` inliers would
+            have been found with this probability.
 
     Returns:
-        The best pose ``T_cw``, ``(4, 4)``, and an ``(N,)`` bool mask of its inliers. The number of
-        inliers may be smaller than ``min_inliers``.
+        The best pose ``T_cw``, ``(4, 4)``, and an ``(N,)`` bool mask of its inliers. The pose may
+        have fewer than ``min_inliers`` inliers.
     """
     fx, fy, cx, cy, _, _ = intrinsics
     n = len(points)

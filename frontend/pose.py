@@ -60,11 +60,10 @@ def pose_covariance(
 ) -> NDArray[np.float64]:
     """Estimate the covariance of an optimised pose relative to the landmarks.
 
-    Assume that the errors of all observations were independent and had the variances that the
-    weights of the observations imply. The covariance would then be the inverse of the normal matrix
-    times a variance factor. In practice, both assumptions are wrong. Observations of near landmarks
-    have larger errors than their weights imply, because depth errors matter more at short
-    distances. Errors are correlated, because one corner is often observed in several octaves.
+    The inverse of the normal matrix would be the covariance if the errors of the observations were
+    independent and had the assumed variances. Neither is the case. Observations of near landmarks
+    have larger errors, because depth errors matter more at short distances. One corner is often
+    observed in several octaves, so the errors are correlated.
 
     Therefore, the spread of the gradient is measured instead of assumed (the sandwich estimator of
     White, Econometrica 1980). The gradients are summed over the cells of a grid, within which
@@ -115,8 +114,8 @@ def offset_effect(
     inverse_sigma2: NDArray[np.float64],
     intrinsics: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Compute how an error in the disparity offset of a stereo camera affects its estimated motion.
-    The effect is linearised.
+    """Compute how an error in the disparity offset of a stereo camera affects its estimated motion,
+    to first order.
 
     If all disparities are too large by one pixel, a point at depth z seems too near by a fraction
     of ``z / bf``. The translation that this point suggests is then too short by the same fraction.
@@ -149,8 +148,8 @@ def _gradients(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics, 
     grid.
 
     Args:
-        first: ``(C + 1,)`` index of the first observation of each cell. The last entry is the
-            number of observations.
+        first: ``(C + 1,)`` index of the first observation of each cell, followed by the number of
+            observations.
 
     Returns:
         The ``(6, 6)`` normal matrix; ``(C, 6)`` gradients of the cells; sum of the chi-squares of
@@ -207,12 +206,12 @@ def _optimise(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics):
 
 @inner_kernel
 def normal_equations(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier, robust):
-    """Linearise the reprojection errors of all inliers at pose ``T``. If ``robust`` is True, the
-    Huber loss is used.
+    """Linearise the reprojection errors of all inliers at pose ``T``, with the Huber loss if
+    ``robust``.
 
     Returns:
-        Lower triangle of the normal matrix, right-hand side, sum of the chi-squares of the
-        observations, number of observations, and number of coordinates of the observations.
+        Lower triangle of the normal matrix, right-hand side, sum of the chi-squares, number of
+        observations, and number of their coordinates.
     """
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     H = np.zeros((6, 6))
@@ -259,8 +258,7 @@ def normal_equations(T, points, uvr, inverse_sigma2, disparity_weight, intrinsic
 
 @inner_kernel
 def classify(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier):
-    """Test each observation with the chi-square test at pose ``T``. The results are written into
-    ``inlier``: True for observations that pass the test."""
+    """Write into ``inlier`` whether each observation passes the chi-square test at pose ``T``."""
     fx, fy, cx, cy, bf, _ = unpacked(intrinsics)
     for i in range(len(points)):
         p = points[i]

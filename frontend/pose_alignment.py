@@ -41,12 +41,8 @@ ROBUST = 1.5  # Huber threshold of a window's error, in multiples of the median 
 
 
 def coarse_levels(pyramid: Pyramid) -> Pyramid:
-    """Return the three small images of a frame that are used for its sparse image alignment,
-    coarsest first.
-
-    The first image is the smallest level of the pyramid, reduced to half size. The second image is
-    the smallest level itself. The third image is the middle level.
-    """
+    """Return the three small images of a frame for sparse image alignment, coarsest first: the
+    smallest pyramid level at half size, the smallest level, and the middle level."""
     height, width = pyramid.shapes[0]
     last, middle = len(pyramid.shapes) - 1, len(pyramid.shapes) // 2
     smallest = pyramid.level(last)
@@ -58,7 +54,7 @@ def coarse_levels(pyramid: Pyramid) -> Pyramid:
 
 
 def coarse_shapes(shapes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the ``(3, 2)`` heights and widths of the three images that ``coarse_levels`` returns.
+    """Return the ``(3, 2)`` heights and widths of the images that ``coarse_levels`` returns.
 
     Args:
         shapes: ``(L, 2)`` heights and widths of the levels of the whole pyramid.
@@ -70,9 +66,10 @@ def coarse_shapes(shapes: NDArray[np.int64]) -> NDArray[np.int64]:
 def coarse_pyramid(
     pixels: NDArray[np.uint8], shapes: NDArray[np.int64], size: tuple[int, int]
 ) -> Pyramid:
-    """Rebuild the result of ``coarse_levels`` from the stored pixels and shapes of its levels.
+    """Rebuild the result of ``coarse_levels`` from its pixels.
 
     Args:
+        shapes: the result of ``coarse_shapes``.
         size: height and width of the whole image, pixels.
 
     Raises:
@@ -105,7 +102,7 @@ def align_pose(
         size: height and width of the whole images, pixels.
 
     Returns:
-        ``(4, 4)`` pose ``T_cw``. If the alignment fails, the predicted pose is returned.
+        ``(4, 4)`` pose (world to camera). It is the predicted pose if the alignment fails.
     """
     stride = -(-len(xyz) // MAX_WINDOWS) or 1
     points = np.ascontiguousarray(transform(T_before, xyz[::stride]))
@@ -127,18 +124,16 @@ def align_pose(
 def _align(image, before, points, T_start, intrinsics, ratio_x, ratio_y):
     """Align one pyramid level of two frames by inverse compositional Gauss-Newton.
 
-    Gradients and Jacobians are computed only once, in the image ``before``.
-
     Args:
         image, before: ``(h, w)`` uint8.
         points: ``(N, 3)`` landmarks in the camera frame of ``before``.
-        T_start: ``(4, 4)`` initial motion: the transform from the camera frame of ``before`` to the
-            camera frame of ``image``.
+        T_start: ``(4, 4)`` initial transform from the camera frame of ``before`` to the camera
+            frame of ``image``.
         ratio_x, ratio_y: full-resolution pixels per pixel of the level.
 
     Returns:
-        The ``(4, 4)`` motion, and the correlation between the windows of ``before`` and ``image``.
-        If the alignment fails, ``T_start`` and 0 are returned.
+        The ``(4, 4)`` transform, and the correlation between the windows of ``before`` and
+        ``image``. If the alignment fails, ``T_start`` and 0 are returned.
     """
     n = len(points)
     template = np.empty((n, PIXELS), np.float32)
@@ -193,12 +188,9 @@ def _corner(point, intrinsics, ratio_x, ratio_y):
 
 @inner_kernel
 def _draw_template(before, point, intrinsics, ratio_x, ratio_y, template, jacobian):
-    """Compute the template of the window around a projected point. Returns False if the window is
-    not inside the image.
-
-    The grey values are written into ``template``. Their derivatives with respect to the motion are
-    written into ``jacobian``. The mean over the window is subtracted from both.
-    """
+    """Read the window around a projected point. The grey values are written into ``template``, and
+    their derivatives with respect to the motion into ``jacobian``. The mean over the window is
+    subtracted from both. Returns False if the window is not inside the image."""
     height, width = before.shape
     x, y, z = point[0], point[1], point[2]
     if not z > 0.1:
@@ -243,9 +235,8 @@ def _draw_template(before, point, intrinsics, ratio_x, ratio_y, template, jacobi
 
 @inner_kernel
 def _read_window(image, T, p, intrinsics, ratio_x, ratio_y, seen):
-    """Move a point by ``T``, project it, and read the grey values of the window around it. The grey
-    values minus their mean are written into ``seen``. Returns False if the window is not inside the
-    image."""
+    """Move a point by ``T``, and read the window around its projection. The grey values minus their
+    mean are written into ``seen``. Returns False if the window is not inside the image."""
     height, width = image.shape
     x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
     y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
@@ -274,7 +265,7 @@ def _read_window(image, T, p, intrinsics, ratio_x, ratio_y, seen):
 
 @inner_kernel
 def _square(jacobian, hessian):
-    """Compute the normal matrix of one window, and write its lower triangle into ``hessian``."""
+    """Write the lower triangle of the normal matrix of one window into ``hessian``."""
     for j in range(6):
         for t in range(j + 1):
             total = np.float32(0.0)

@@ -68,10 +68,10 @@ class Relocaliser:
         """Relocalise a frame if it is lost or doubtful. A frame is doubtful if it has so few
         inliers that its matches may be wrong.
 
-        A lost frame is relocalised only if no keyframe is being mapped at the moment. If the frame
-        is doubtful, the method first waits until no keyframe is being mapped. A doubtful frame
-        usually keeps its tracked pose. It takes the pose of the relocalisation only if this pose
-        has more than ``relocalization.better`` times as many inliers.
+        A lost frame is relocalised only if no keyframe is being mapped at the moment. For a
+        doubtful frame, the method first waits until no keyframe is being mapped. A doubtful frame
+        keeps its tracked pose, unless the relocalised pose has more than ``relocalization.better``
+        times as many inliers.
 
         Args:
             found: the result of tracking the frame.
@@ -92,8 +92,6 @@ class Relocaliser:
         return found
 
     def _find(self, frame: Frame, map_: Map) -> Found:
-        """Relocalise a frame at keyframes that look similar. ORB descriptors are tried first. If
-        the frame cannot be located using ORB descriptors, ``recognise`` is called."""
         config = self._context.config.relocalization
         candidates = self._locate(frame.image, frame.features, map_)
         for candidate in candidates[: config.max_candidates]:
@@ -124,14 +122,13 @@ def relocalise(
 
     The descriptors of the frame are matched with the landmarks of the place. A pose is estimated
     from the matches by P3P inside RANSAC, which needs no stereo. Then all landmarks of the
-    surroundings are searched for near their projections. The search first uses wide windows and
-    then windows of the usual size.
+    surroundings are searched for near their projections. The first search uses wide windows, and
+    the second search uses windows of the usual size.
 
     Args:
         frame: receives the pose and the matches. On failure, both are reset.
         place: the landmarks of a candidate keyframe.
         surroundings: the landmarks of the candidate and its covisible keyframes.
-        seed: seed of the random samples; the same seed gives the same result.
 
     Returns:
         Number of inliers, or 0 if the pose was not found. A pose is accepted if it has at least

@@ -1,9 +1,9 @@
 """Corrects the measurements of a stereo rig for errors that remain after rectification.
 
-Two errors are corrected. The first error is a common offset of all disparities. It is estimated
-while the map grows (``backend/disparity_offset.py``). The second error is the delay of the right
-image. The calibration file gives this delay (``Camera.right_delay``). The delay is also measured,
-but the measured value is only reported.
+The first error is a common offset of all disparities. It is estimated while the map grows
+(``backend/disparity_offset.py``). The second error is the delay of the right image. The calibration
+file gives this delay (``Camera.right_delay``). The delay is also measured, but the measured value
+is only reported.
 """
 
 from __future__ import annotations
@@ -33,8 +33,7 @@ class RigCalibration:
 
     Attributes:
         disparity_offset: offset that is added to every measured disparity, in pixels. The owner of
-            the map sets it to the disparity offset of the map each time that a mapped keyframe is
-            merged.
+            the map sets it each time that a mapped keyframe is merged.
         offset_sigma: standard deviation of ``disparity_offset``, in pixels. The owner of the map
             sets both at the same time.
         delay: the measured delay of the right image.
@@ -43,10 +42,8 @@ class RigCalibration:
     """
 
     def __init__(self, camera: Camera, config: StereoConfig, scales: NDArray[np.float64]) -> None:
-        """
-        Args:
-            scales: ``(levels,)`` pyramid scale factors.
-        """
+        """Args:
+        scales: ``(levels,)`` pyramid scale factors."""
         self.disparity_offset, self.offset_sigma = 0.0, 0.0
         self.delay = SideDelay(camera, config)
         self.sides = ComparedSides()
@@ -55,8 +52,8 @@ class RigCalibration:
         self._scales = scales
 
     def extract(self, frame: Frame, twist: Matrix | None) -> None:
-        """Extract the features of a frame, unless this has already been done, and correct them
-        using ``prepare``. The difference in exposure between its two images is recorded."""
+        """Extract the features of a frame, unless this has already been done, and correct them with
+        ``prepare``. The difference in exposure between its two images is recorded."""
         source = frame.source
         frame.extract(self._camera)
         if source is not None and source.sides is not None:
@@ -87,8 +84,8 @@ class RigCalibration:
         frame.delay_removed = True
 
     def correct_offset(self, frame: Frame) -> None:
-        """Apply the current disparity offset to a frame. It replaces the offset that was applied to
-        the frame earlier."""
+        """Replace the disparity offset that was applied to a frame earlier with the current
+        offset."""
         change = self.disparity_offset - frame.disparity_offset
         if change == 0.0:
             return
@@ -97,12 +94,12 @@ class RigCalibration:
         frame.disparity_offset = self.disparity_offset
 
     def mark_corrected(self, frame: Frame) -> None:
-        """Mark a frame that was restored from a checkpoint as corrected. Its columns in the right
-        image were corrected before the frame was saved."""
+        """Mark a frame that was restored from a checkpoint as corrected. It was corrected before it
+        was saved."""
         frame.disparity_offset, frame.delay_removed = self.disparity_offset, True
 
     def observe(self, frame: Frame, twist: Matrix | None) -> None:
-        """Update the measured delay of the right image using a tracked frame.
+        """Update the measured delay of the right image with a tracked frame.
 
         Args:
             twist: ``(6,)`` mean velocity since the previous frame, see ``Frame.twist``; None if
@@ -111,12 +108,12 @@ class RigCalibration:
         self.delay.add(frame.features, frame.row_offset, twist, self._scales)
 
     def state(self) -> RigState:
-        """Return the measurements obtained so far, to store them in a map file or a checkpoint. The
-        disparity offset is not included, because it is part of the map."""
+        """Return the measurements so far, for a map file or a checkpoint. The disparity offset is
+        not included, because it is part of the map."""
         return RigState(self.delay.state().numbers(), self.sides.numbers())
 
     def restore(self, state: RigState) -> None:
-        """Restore a state that the method ``state`` returned.
+        """Restore the measurements that ``state`` returned.
 
         Raises:
             ValueError: the stored state is damaged.

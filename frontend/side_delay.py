@@ -49,12 +49,14 @@ _SOLUTION, _TWIST, _WAITING, _GROUP = (1 + _P,), (6,), (7 + _P, 7 + _P), (2 + _P
 def row_offsets(
     left: Extraction, right: Extraction, u_right: NDArray[np.float32], config: StereoConfig
 ) -> NDArray[np.float32]:
-    """Measure the ``(N,)`` float32 row offset of each feature, in full-resolution pixels. It is the
-    row in the right image minus the row in the left image. Only a subset of the features is
-    measured. The row offset of all other features is NaN.
+    """Measure the row of features in the right image minus their row in the left image, in
+    full-resolution pixels. Only a subset of the features is measured.
 
     Args:
         u_right: ``(N,)`` columns of the left features in the right image, NaN without a match.
+
+    Returns:
+        ``(N,)`` float32, NaN for features that were not measured.
     """
     pyramid = left.pyramid
     return _row_offsets(
@@ -89,13 +91,10 @@ def _row_offsets(xy, octave, u_right, pixels_l, pixels_r, offsets, shapes, half)
 @inner_kernel
 def _row_shift(image_l, image_r, x, y, dx, half):
     """Measure the vertical shift of the patch around ``(x, y)`` from the left to the right image,
-    in pixels of the pyramid level.
+    in pixels of the pyramid level. The search starts at the horizontal shift ``dx``.
 
-    The search starts at the horizontal shift ``dx``. The result is NaN if the patch has too little
-    texture or is not found.
-
-    The method is inverse compositional Lucas-Kanade (Baker and Matthews, IJCV 2004). It computes
-    gradients only in the left patch.
+    The result is NaN if the patch has too little texture or is not found. The method is inverse
+    compositional Lucas-Kanade (Baker and Matthews, IJCV 2004).
     """
     height, width = image_l.shape
     edge = half + 1
@@ -140,7 +139,6 @@ def _row_shift(image_l, image_r, x, y, dx, half):
 
 @inner_kernel
 def _interpolated(image, x, y, a, b):
-    """Return the grey value at ``(x + a, y + b)``, interpolated bilinearly."""
     upper = (1.0 - a) * float(image[y, x]) + a * float(image[y, x + 1])
     lower = (1.0 - a) * float(image[y + 1, x]) + a * float(image[y + 1, x + 1])
     return (1.0 - b) * upper + b * lower
@@ -148,15 +146,15 @@ def _interpolated(image, x, y, a, b):
 
 @dataclass(eq=False)
 class DelayState:
-    """The state of ``SideDelay``, which estimates the delay of the right image. "Moments" are
-    weighted second moments of the variables of a regression; see ``SideDelay._moments``.
+    """The state of ``SideDelay``. "Moments" are weighted second moments of the variables of a
+    regression; see ``SideDelay._moments``.
 
     Attributes:
         n_group: number of frames in the group that is being filled.
         length: number of frames in a full group.
         solution: ``(1 + P,)`` the delay in seconds, followed by the P coefficients of the
-            polynomial that models a wrong calibration. The delay and the coefficients were
-            estimated when the last group became full.
+            polynomial that models a wrong calibration. It is estimated whenever a group becomes
+            full.
         twist: ``(6,)`` velocity of the camera before the last frame, see ``Frame.twist``.
         waiting: ``(7 + P, 7 + P)`` moments of the last frame, which has not been added to a group
             yet.
@@ -193,8 +191,8 @@ class DelayState:
 
     @classmethod
     def of_numbers(cls, numbers: tuple[float, ...]) -> DelayState:
-        """Create a state from the numbers that the method ``numbers`` returned. An empty tuple
-        gives the state before the first frame.
+        """Create a state from the result of ``numbers``. An empty tuple gives the state before the
+        first frame.
 
         Raises:
             ValueError: ``numbers`` does not have the length of a state.
@@ -226,11 +224,11 @@ class SideDelay:
     velocities are linear in the twist of the camera.
 
     Attributes:
-        seconds: the delay in seconds. It is positive if the right image is taken later than the
-            left image.
-        sigma: standard deviation of ``seconds``. It is estimated from the disagreement between
-            groups of frames (cluster-robust: Liang and Zeger, Biometrika 1986). It is infinite
-            until there are enough groups.
+        seconds: the delay in seconds, positive if the right image is taken later than the left
+            image.
+        sigma: standard deviation of ``seconds``, estimated from the disagreement between groups of
+            frames (cluster-robust: Liang and Zeger, Biometrika 1986). It is infinite until there
+            are enough groups.
     """
 
     def __init__(self, camera: Camera, config: StereoConfig) -> None:
@@ -251,13 +249,12 @@ class SideDelay:
         twist: Matrix | None,
         scales: NDArray[np.float64],
     ) -> None:
-        """Add the measurements of a tracked frame.
+        """Add the measurements of a tracked frame. A frame without row offsets or with an unknown
+        velocity is skipped.
 
         Args:
-            features: the N features of the frame.
-            row_offset: ``Extracted.row_offset``; if None, the frame is skipped.
-            twist: ``(6,)`` mean velocity since the previous frame, see ``Frame.twist``. If it is
-                None (unknown), the frame is skipped.
+            row_offset: ``Extracted.row_offset``.
+            twist: ``(6,)`` mean velocity since the previous frame, see ``Frame.twist``.
             scales: ``(levels,)`` pyramid scale factors.
         """
         state = self._state
@@ -269,14 +266,13 @@ class SideDelay:
         state.waiting = self._moments(features, row_offset, twist, scales)
 
     def state(self) -> DelayState:
-        """Return the state, to store it in a map file or a checkpoint."""
+        """Return the state for a map file or a checkpoint."""
         return deepcopy(self._state)
 
     def restore(self, state: DelayState) -> None:
-        """Restore a state that the method ``state`` returned."""
         self.seconds, self.sigma = 0.0, np.inf
         self._state = deepcopy(state)
-        self._solve()
+        self._estimate()
 
     def _moments(
         self,
@@ -323,10 +319,9 @@ class SideDelay:
             if len(state.groups) == MOST_GROUPS:  # merge neighbours in pairs
                 state.groups = state.groups[::2] + state.groups[1::2]
                 state.length *= 2
-            self._solve()
+            self._estimate()
 
-    def _solve(self) -> None:
-        """Estimate the delay and its standard deviation from all full groups."""
+    def _estimate(self) -> None:
         groups = self._state.groups
         if len(groups) < FEWEST_GROUPS:
             return

@@ -37,11 +37,10 @@ class Sides:
     """The difference in exposure between the left and the right image of a stereo pair.
 
     Attributes:
-        darker_stops: difference in exposure, in stops. It is positive if the right image is darker
-            than the left one. It is 0 if the difference is below the threshold, or if a common gain
-            does not explain the difference.
-        black: the side whose image is black while the other image is not. Empty if there is no such
-            side.
+        darker_stops: difference in exposure, in stops; positive if the right image is darker. It is
+            0 if the difference is below the threshold, or if a common gain does not explain the
+            difference.
+        black: the side whose image is black while the other image is not; empty if there is none.
     """
 
     darker_stops: float = 0.0
@@ -53,7 +52,6 @@ class ComparedSides:
     """A summary of the differences in exposure of all stereo pairs of a drive.
 
     Attributes:
-        n: number of stereo pairs that were compared.
         n_black_left, n_black_right: number of stereo pairs whose left or right image was black.
         darker_stops: all values of ``Sides.darker_stops`` that are not 0.
     """
@@ -64,7 +62,6 @@ class ComparedSides:
     darker_stops: list[float] = field(default_factory=list)
 
     def add(self, sides: Sides) -> None:
-        """Add the comparison of one stereo pair to the summary."""
         self.n += 1
         self.n_black_left += sides.black == "left"
         self.n_black_right += sides.black == "right"
@@ -77,7 +74,7 @@ class ComparedSides:
 
     @classmethod
     def of_numbers(cls, numbers: tuple[float, ...]) -> ComparedSides:
-        """Create a summary from the numbers that the method ``numbers`` returned.
+        """Create a summary from the result of ``numbers``.
 
         Raises:
             ValueError: ``numbers`` is too short.
@@ -109,8 +106,7 @@ def balanced(left: Grey, right: Grey, sides: Sides) -> tuple[Grey, Grey]:
 
 def _shares(image: Grey) -> NDArray[np.float64]:
     """Compute the ``(256,)`` cumulative histogram of an image. Entry i is the fraction of the
-    pixels whose grey value is at most i.
-    """
+    pixels whose grey value is at most i."""
     counts = np.bincount(image[::_STRIDE, ::_STRIDE].ravel(), minlength=256)
     return np.cumsum(counts) / counts.sum()
 
@@ -131,8 +127,8 @@ def _is_black(side: NDArray[np.float64], other: NDArray[np.float64], config: Ste
 
 
 def _stops(left: NDArray[np.float64], right: NDArray[np.float64], config: StereoConfig) -> float:
-    """Estimate the gain from the right to the left image, in stops. The arguments are the
-    cumulative histograms of both images (``_shares``).
+    """Estimate the gain from the right to the left image, in stops, from their cumulative
+    histograms.
 
     The result is 0 if the gain is below the threshold, or if dark and bright pixels have different
     gains. Quantiles that are overexposed in either image are not compared.
@@ -164,9 +160,9 @@ def _stops(left: NDArray[np.float64], right: NDArray[np.float64], config: Stereo
 
 
 def _proportional(left: NDArray[np.float64], right: NDArray[np.float64], top: float) -> bool:
-    """Return whether the quantiles of both images up to ``top`` are proportional. The quantiles are
-    proportional if the images differ only by a gain. They are not proportional if, for example,
-    only one of the images shows the sky beside a bridge."""
+    """Return whether the quantiles of both images up to ``top`` are proportional, as they are if
+    the images differ only by a gain. They are not proportional if, for example, only one of the
+    images shows the sky beside a bridge."""
     at = np.linspace(_LOW, top, _N_QUANTILES)
     a, b = (np.array(_quantiles(shares, *at)) for shares in (left, right))
     a, b = a - a[0], b - b[0]
@@ -174,8 +170,8 @@ def _proportional(left: NDArray[np.float64], right: NDArray[np.float64], top: fl
 
 
 def _brightened(dark: Grey, bright: Grey, stops: float) -> Grey:
-    """Brighten the darker image: multiply its grey values by ``2 ** stops``, and shift them so that
-    both images have the same lower quantile."""
+    """Multiply the grey values of the darker image by ``2 ** stops``, and shift them so that both
+    images have the same lower quantile."""
     (low,), (target,) = _quantiles(_shares(dark), _LOW), _quantiles(_shares(bright), _LOW)
     table = (np.arange(256) + 0.5 - low) * 2.0**stops + target - 0.5
     return np.clip(np.rint(table), 0, 255).astype(np.uint8)[dark]

@@ -71,12 +71,11 @@ def match_stereo(
 
 
 class _Side(NamedTuple):
-    """One image of a stereo pair, as an argument of kernels.
+    """One image of a stereo pair, as an argument of kernels: N features, and the pixels of its
+    pyramid.
 
     Attributes:
-        xy, octave, descriptor: ``(N, 2)`` positions, ``(N,)`` pyramid levels and ``(N, 4)``
-            descriptors of the features of the image.
-        pixels: the pixels of the pyramid of the image.
+        xy, octave, descriptor: ``(N, 2)``, ``(N,)`` and ``(N, 4)``.
     """
 
     xy: NDArray[np.float32]
@@ -121,9 +120,9 @@ def rows_to_features(xy, octave, scales, height):
 
 @kernel
 def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, half, reach):
-    """Match each left feature with a right feature. Returns the ``(N,)`` float32 column of each
-    match in the right image, and the ``(N,)`` float32 sum of absolute differences (SAD) of each
-    match. For features without a match, the column is NaN and the SAD is -1."""
+    """Return the ``(N,)`` float32 column of each match in the right image, and its ``(N,)`` float32
+    sum of absolute differences (SAD). For features without a match, the column is NaN and the SAD
+    is -1."""
     xy_l, octave_l, descriptors_l, pixels_l = left
     xy_r, octave_r, descriptors_r, pixels_r = right
     n = len(xy_l)
@@ -175,7 +174,7 @@ def _match(left, right, offsets, shapes, scales, max_disparity, max_distance, ha
 def inliers_only(matches: StereoMatches, octave: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the columns of the matches in the right image, with NaN for outliers. A match is an
     outlier if its sum of absolute differences (SAD) exceeds ``MEDIAN_FACTOR`` times the median SAD
-    of all matches in its octave.
+    of its octave.
 
     Args:
         octave: ``(N,)`` uint8 octave of each feature, sorted.
@@ -207,11 +206,12 @@ def _inliers_only(matched, sad, octave):
 @kernel
 def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
     """Slide a patch of the right image along its row, and find the shift at which it agrees best
-    with a patch of the left image. Returns the shift, in pixels of the pyramid level, and the sum
-    of absolute differences (SAD) at this shift.
+    with a patch of the left image.
 
-    The shift is relative to the column ``x_r`` of the right image. The shift is NaN if a patch
-    would leave the image, or if the least SAD is at an end of the search range.
+    Returns:
+        The shift relative to the column ``x_r``, in pixels of the pyramid level, and the sum of
+        absolute differences (SAD) at this shift. The shift is NaN if a patch would leave the image,
+        or if the least SAD is at an end of the search range.
     """
     height, width = image_l.shape
     if (
@@ -239,12 +239,11 @@ def slide(image_l, image_r, x_l, y_l, x_r, half, reach):
 
 @inner_kernel
 def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
-    """Compute the sum of absolute differences between two patches at each shift, and add it to
-    ``costs``.
+    """Add the sum of absolute differences of two patches at each shift to ``costs``.
 
     A vector register holds ``LANES`` shifts. Four columns of the patch are summed before the
-    register is stored. Lanes beyond the last shift may read from the next row. The caller ignores
-    these lanes.
+    register is stored. Lanes beyond the last shift may read from the next row, and the caller
+    ignores them.
     """
     width = image_l.shape[1]
     flat_l, flat_r = image_l.reshape(image_l.size), image_r.reshape(image_r.size)
@@ -282,8 +281,8 @@ def add_differences(image_l, image_r, x_l, y_l, x_r, half, reach, costs):
 
 @inline
 def difference(a, b):
-    """Return the absolute difference of two bytes. The difference is computed in bytes, so that a
-    vector register holds many differences."""
+    """Return the absolute difference of two bytes. It is computed in bytes, so that a vector
+    register holds many differences."""
     return np.uint16(np.uint8(max(a, b) - min(a, b)))
 
 

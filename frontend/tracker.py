@@ -28,7 +28,7 @@ from vslam.states import TrackerState
 
 
 class TrackerStatus(Enum):
-    """What the tracker knows about the position of the camera."""
+    """The state of the tracker between two frames."""
 
     UNKNOWN = "unknown"
     """No frame has been tracked in this map. The camera may be anywhere in it."""
@@ -52,7 +52,7 @@ class Found:
         visible: ``(N,)`` int32 ids of the landmarks that the frame should see.
         keyframe: id of the keyframe at which the frame was relocalised; -1 if it was not
             relocalised.
-        is_doubtful: True if the frame has so few inliers that its matches with landmarks may be
+        is_doubtful: whether the frame has so few inliers that its matches with landmarks may be
             wrong.
     """
 
@@ -65,11 +65,8 @@ class Found:
 
     @classmethod
     def at_start(cls, frame: Frame, *, begun: bool) -> Found:
-        """Create the result for a frame that was not tracked because no map exists yet.
-
-        If the frame has started a map (``begun``), the state is OK, and all landmarks that the
-        frame created are inliers. Otherwise the state is LOST.
-        """
+        """Create the result for a frame before a map exists. The state is OK if the frame has
+        started a map (``begun``), and LOST otherwise."""
         n_landmarks = int(np.count_nonzero(frame.landmark >= 0))
         state = TrackingState.OK if begun else TrackingState.LOST
         return cls(state, n_landmarks, n_landmarks)
@@ -81,13 +78,12 @@ class Found:
 
     @property
     def relocalised(self) -> bool:
-        """Whether the pose of the frame was found by relocalisation, which is a search of the whole
+        """Whether the pose of the frame was found by relocalisation, which searches the whole
         map."""
         return self.keyframe >= 0
 
 
 def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingState:
-    """Return the tracking state of a frame with the given numbers of matches and inliers."""
     config = context.config.tracking
     # The search windows of an RGB-D camera are wide, so that even a wrong pose has some inliers.
     share = config.depth_min_inlier_ratio if context.camera.depth else 0.0
@@ -97,13 +93,12 @@ def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingS
 
 
 class Tracker:
-    """Tracks one frame after another. It reads only a ``MapView``, a copy of the map, not the map
-    itself.
+    """Tracks one frame after another. It reads only a ``MapView``, not the map itself.
 
     Attributes:
         status: whether the last frame was tracked or lost, or no frame has been tracked yet.
-        last: the last frame that was tracked; None before a frame was tracked.
-        lost_frames: number of frames that were lost since the frame ``last``.
+        last: the last frame that was tracked; None until a frame has been tracked.
+        lost_frames: number of frames that have been lost since the frame ``last``.
     """
 
     def __init__(self, context: TrackingContext) -> None:
@@ -122,7 +117,7 @@ class Tracker:
         return self._resumed_twist if self.last is None else self.last.twist
 
     def predict(self, timestamp: float, frames: FramePoses, view: MapView) -> Matrix:
-        """Predict the pose of the camera at a given time.
+        """Predict the ``(4, 4)`` pose of the camera (world to camera) at a given time.
 
         The camera is assumed to keep its velocity. The velocity is measured per second, not per
         frame, so that dropped frames do not distort the prediction. If no frame has been tracked
@@ -131,9 +126,6 @@ class Tracker:
         Args:
             timestamp: seconds.
             frames: poses of all earlier frames, including lost frames.
-
-        Returns:
-            ``(4, 4)`` pose ``T_cw`` (world to camera).
         """
         if not len(frames):
             return view.T_reference
@@ -144,11 +136,13 @@ class Tracker:
         return orthonormalised(se3_exp(self.twist * elapsed) @ T_last)
 
     def track_patches(self, frame: Frame, T_cw: Matrix, view: MapView) -> Found:
-        """Track a frame using the image patches of landmarks, without extracting features. ``T_cw``
-        is the predicted ``(4, 4)`` pose (world to camera).
+        """Track a frame using the image patches of landmarks, without extracting features.
 
         The result is LOST if too few patches are found. It is also LOST if the frame cannot be
         tracked in this way, for example because the previous frame was not tracked.
+
+        Args:
+            T_cw: ``(4, 4)`` predicted pose (world to camera).
         """
         last, config = self.last, self._config.tracking
         if frame.pyramid is None or frame.source is None or not len(view.patches.ids):
@@ -189,14 +183,11 @@ class Tracker:
         return judge(n_matches, n_inliers, self._context) != TrackingState.LOST
 
     def track(self, frame: Frame, T_cw: Matrix, view: MapView, frames: FramePoses) -> Found:
-        """Track a frame using its features.
-
-        First, the frame is tracked against the last frame or the reference keyframe. Then it is
-        tracked against all landmarks of the local map.
+        """Track a frame using its features, first against the last frame or the reference keyframe,
+        and then against all landmarks of the local map.
 
         Args:
             T_cw: ``(4, 4)`` predicted pose (world to camera).
-            frames: poses of all earlier frames.
         """
         n_inliers = self._track_previous_frame(frame, T_cw, view)
         if n_inliers < self._config.tracking.min_inliers_frame:
@@ -214,9 +205,6 @@ class Tracker:
 
         The twist of the frame is computed from the motion since the last tracked frame. A
         relocalised frame gets no twist, because the jump to its pose is not a motion of the camera.
-
-        Args:
-            frames: poses of all earlier frames.
         """
         if not found.relocalised:
             last = -1 if self.last is None else self.last.index
@@ -230,7 +218,6 @@ class Tracker:
         self.last, self.lost_frames, self.status = frame, 0, TrackerStatus.TRACKING
 
     def lose(self) -> None:
-        """Count a frame that was not tracked as lost, and update the state of the tracker."""
         self.lost_frames += 1
         self.status = TrackerStatus.LOST
 
@@ -243,8 +230,7 @@ class Tracker:
         self.status, self._resumed_twist = TrackerStatus.RESUMED, twist
 
     def state(self) -> TrackerState | None:
-        """Return the state between two frames, to save it in a checkpoint. Returns None before the
-        first frame is tracked."""
+        """Return the state for a checkpoint, or None before the first frame is tracked."""
         last = self.last
         if last is None:
             return None
@@ -261,7 +247,7 @@ class Tracker:
         )
 
     def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
-        """Restore a state that the method ``state`` returned. Returns the last tracked frame.
+        """Restore the state of a checkpoint. Returns the last tracked frame.
 
         Args:
             xyz: ``(N, 3)`` positions of the landmarks that the last frame tracks, in the world
@@ -285,11 +271,9 @@ class Tracker:
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
         """Find a first pose and first matches of a frame. Returns the number of inliers.
 
-        If the motion is known, the frame is tracked against the last frame, using the predicted
-        pose. If the motion is unknown or tracking against the last frame fails, the frame is
-        tracked against the reference keyframe. If that fails too and the motion is known,
-        ``_track_predicted`` is called. The last attempt assumes that the motion has changed
-        suddenly since the last frame.
+        Four methods are tried in turn: tracking against the last frame, tracking against the
+        reference keyframe, ``_track_predicted``, and ``_track_sudden_motion``. Only the second
+        method works if the motion is unknown.
         """
         if self.last is None and self.status is not TrackerStatus.RESUMED:
             return 0
@@ -335,8 +319,8 @@ class Tracker:
         return n_inliers >= max(self._config.tracking.min_inliers_motion, min_ratio * n_matches)
 
     def _is_doubtful(self, frame: Frame, n_inliers: int, view: MapView, frames: FramePoses) -> bool:
-        """Return whether a frame is doubtful. A frame is doubtful if it has so few inliers that its
-        matches may be wrong and there is another reason for doubt.
+        """Return whether a frame has few inliers and there is another reason why its matches may be
+        wrong.
 
         There are three such reasons. The first is a gap in time. The second is an unknown motion,
         because the pose was then not predicted. The third is a sudden drop in the number of
@@ -361,8 +345,6 @@ def result_of(
     stage_ms: dict[str, float],
     odometry: Odometry,
 ) -> TrackResult:
-    """Create the ``TrackResult`` of a frame, which the library returns to its caller. ``stage_ms``
-    is the time that each stage took, in milliseconds."""
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,

@@ -52,9 +52,8 @@ class TrackingContext:
 
     @property
     def tracks_patches(self) -> bool:
-        """Whether frames are tracked using image patches when possible. RGB-D cameras are excluded:
-        for them, patch-based tracking is less accurate and not faster
-        (docs/research/performance.md)."""
+        """Whether frames are tracked using image patches when possible. For RGB-D cameras,
+        patch-based tracking is less accurate and not faster (docs/research/performance.md)."""
         method, camera = self.config.tracking.method, self.camera
         if method == "auto":
             return camera.sensor == "stereo"
@@ -80,22 +79,19 @@ class TrackingContext:
 
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
-    """Compute the ``(N,)`` float64 stereo depth of each feature, in metres. It is NaN for features
-    without a stereo match."""
+    """Compute the ``(N,)`` float64 stereo depth of each feature, in metres; NaN without a stereo
+    match."""
     return camera.bf / (features.xy[:, 0].astype(np.float64) - features.u_right)
 
 
 def track_motion(
     frame: Frame, previous: Frame, T_cw: NDArray[np.float64], context: TrackingContext
 ) -> tuple[int, int]:
-    """Track a frame against the points of the previous frame.
+    """Track a frame against the points of the previous frame. The points are matched near their
+    projections with the predicted pose, and the pose is optimised.
 
-    The points are projected with the predicted pose and matched near their projections. Then the
-    pose is optimised.
-
-    The points are the landmarks of the previous frame and its other close stereo points, which are
-    not in the map (the visual-odometry points of ORB-SLAM2). The stereo points stabilise the pose
-    and are then discarded.
+    The points are the landmarks of the previous frame and its other close stereo points (the
+    visual-odometry points of ORB-SLAM2).
 
     Args:
         frame: receives the pose and the matches.
@@ -273,13 +269,13 @@ def track_local_map(
     window: float | None = None,
     patches: LandmarkPatches = NO_PATCHES,
 ) -> tuple[int, int, NDArray[np.int32]]:
-    """Match all landmarks of the local map that should be visible, and optimise the pose. The
-    matches are first aligned to the image with sub-pixel accuracy.
+    """Match all landmarks of the local map that should be visible, align the matches to the image
+    with sub-pixel accuracy, and optimise the pose.
 
     Args:
         frame: receives the pose and the matches.
         window: search radius at octave 0, pixels; None uses ``context.local_window``.
-        patches: patches of those landmarks whose matches can be aligned.
+        patches: image patches of landmarks. Only the matches of these landmarks are aligned.
 
     Returns:
         Number of matches, number of inliers, and ``(V,)`` int32 ids of the landmarks that should be
@@ -340,8 +336,8 @@ def _search(
     context: TrackingContext,
     ratio: float,
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Run ``search_windows`` in a frame. Returns the ``(M,)`` indices of the matched features and
-    the ``(M,)`` indices of their projections."""
+    """Return the ``(M,)`` indices of the features that ``search_windows`` matches, and the ``(M,)``
+    indices of their projections."""
     features = Searchable.of_features(frame.features, frame.grid)
     max_distance = context.config.tracking.match_distance
     found, _ = search_windows(projections, features, free, max_distance, ratio)
@@ -383,8 +379,8 @@ def uncertainty_of(
     Returns:
         Two matrices. The first is the ``(6, 6)`` covariance of the pose ``T_cw`` relative to the
         points that the frame tracks (``pose_covariance``). The second is the ``(6, 3)`` effect on
-        the motion if the disparity offset is wrong by ``offset_sigma`` (``offset_effect``). The
-        second matrix is None if ``offset_sigma`` is 0.
+        the motion if the disparity offset is wrong by ``offset_sigma`` (``offset_effect``). It is
+        None if ``offset_sigma`` is 0.
     """
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
     observed = _observed_points(frame, matched, context)
@@ -401,10 +397,8 @@ def uncertainty_of(
 def _observed_points(
     frame: Frame, matched: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], ...]:
-    """Return the arguments of ``optimise_pose`` that follow ``T_cw``. These arguments describe the
-    points that the features ``matched`` track. For matches that were aligned, the aligned positions
-    are used.
-    """
+    """Return the arguments of ``optimise_pose`` that follow ``T_cw``, for the points that the
+    features ``matched`` track. Aligned matches have their aligned positions."""
     uvr, weight = observations(frame, matched, context)
     certainty = np.ones(len(matched))
     if frame.shift is not None:
@@ -420,8 +414,8 @@ def _observed_points(
 def observations(
     frame: Frame, feature: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return two arrays for ``(N,)`` features of a frame: their ``(N, 3)`` float64 u, v and
-    u_right, in pixels, and the ``(N,)`` float64 inverse variances of u and v."""
+    """Return two arrays for ``(N,)`` features of a frame: their ``(N, 3)`` float64 u, v, u_right,
+    in pixels, and the ``(N,)`` float64 inverse variances of u and v."""
     features = frame.features
     uvr = stack_uvr(features.xy[feature], features.u_right[feature])
     return uvr, context.scales[features.octave[feature]] ** -2.0

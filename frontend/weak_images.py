@@ -49,9 +49,8 @@ def extract_in_any_light(
     stereo matching compares their patches.
 
     Args:
-        image_map: applies a function to all images, sequentially or in parallel. Both ways give the
-            same result.
-        allowed: pyramid that is 1 where the first image may have corners, see ``extract``; None
+        image_map: applies a function to all images, sequentially or in parallel.
+        allowed: mask pyramid, 1 where the first image may have corners, see ``extract``; None
             allows all pixels.
         pyramid: the pyramid of the first image, if it has already been built.
     """
@@ -90,8 +89,8 @@ def without_noise(images: Sequence[Grey], config: WeakImageConfig) -> Sequence[G
 def grain(image, stride, least):
     """Estimate the noise and the spikes of an ``(H, W)`` uint8 image from every ``stride``-th row.
 
-    Noise is estimated from the median of absolute second differences along a row. The median is
-    robust to edges. The mean, which Immerkaer (CVIU 1996) uses, is not robust to edges.
+    Noise is estimated from the median of absolute second differences along a row. The mean, which
+    Immerkaer (CVIU 1996) uses, is not robust to edges.
 
     Returns:
         Standard deviation of the noise, in grey levels; share of the pixels that are spikes. A
@@ -128,9 +127,8 @@ def grain(image, stride, least):
 def is_faint(images: Sequence[Grey], counts: Sequence[int], config: Config) -> bool:
     """Return whether at least one of the images has few corners because of low contrast.
 
-    An image that is out of focus also has few corners. Such an image is not counted, because
-    raising its contrast would only amplify rounding errors. An image that shows nothing at all is
-    ignored.
+    An image that is out of focus also has few corners. It does not count, because raising its
+    contrast would only amplify rounding errors. An image that shows nothing at all is ignored.
 
     Args:
         counts: number of features of each image.
@@ -154,8 +152,8 @@ def detail(image: Grey) -> float:
 
 
 def contrast(image: Grey) -> float:
-    """Measure the contrast of an image, in grey levels. The standard deviation of the grey values
-    is computed in each block of the image. The result is the median over all blocks."""
+    """Compute the median standard deviation of the grey values in the blocks of an image, in grey
+    levels."""
     rows, columns = (side // _BLOCK * _BLOCK for side in image.shape)
     if not rows or not columns:
         return 0.0
@@ -166,9 +164,9 @@ def contrast(image: Grey) -> float:
 def with_contrast(image: Grey, config: WeakImageConfig) -> Grey:
     """Normalise the local contrast of an ``(H, W)`` uint8 image.
 
-    The image is first blurred by one pixel. Then the grey values are scaled so that the window
-    around every pixel (``contrast_window``) has the same standard deviation. Flat regions, which
-    contain only noise, are amplified less.
+    The image is blurred by one pixel. Then the grey values are scaled so that the window around
+    every pixel (``contrast_window``) has the same standard deviation. Flat regions, which contain
+    only noise, are amplified less.
     """
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
     window = (config.contrast_window, config.contrast_window)

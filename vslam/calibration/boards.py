@@ -1,7 +1,6 @@
 """Calibration boards: describes them, detects their corners, and recognises unknown boards.
 
-Boards are recognised only for error messages. If the images do not show the expected board, the
-message tells which board they show.
+If the images do not show the expected board, the error message tells which board they show.
 
 A board lies in the plane z = 0 of its frame. The frame of a checkerboard or ChArUco board has x to
 the right, y down and z away from the viewer. The frame of an AprilGrid is defined as in Kalibr,
@@ -114,9 +113,7 @@ class View:
     """The corners of a board that are visible in one image.
 
     Attributes:
-        name: name of the image, for messages.
-        ids: ``(N,)`` int64 numbers of the corners. Corner ``i`` has its position in row ``i`` of
-            the array that `board_points` returns.
+        ids: ``(N,)`` int64 numbers of the corners, which are rows of `board_points`.
         xy: ``(N, 2)`` float64 positions of the corners in pixels.
     """
 
@@ -175,9 +172,9 @@ def find_corners(board: Board, image: Image, name: str = "") -> View | None:
 def same_order(board: Board, left: View, right: View) -> View:
     """Renumber the corners in the right image so that they correspond to those in the left image.
 
-    Some checkerboards look the same upside down. Therefore, the numbering of their corners may
-    start at either end. The function chooses the numbering for which the offsets between
-    corresponding corners of the two images vary least.
+    Some checkerboards look the same upside down, so the numbering of their corners may start at
+    either end. The function chooses the numbering for which the offsets between corresponding
+    corners of the two images vary least.
     """
     if board.kind != "checkerboard":
         return right
@@ -188,10 +185,8 @@ def same_order(board: Board, left: View, right: View) -> View:
 
 
 def other_board(board: Board, images: Sequence[Image]) -> str:
-    """Return a text that names the board in ``images`` and its options, for an error message.
-
-    The text is empty if the images show ``board``, or if no board is recognised.
-    """
+    """Return a text that names the board in ``images`` and its options, for an error message. The
+    text is empty if the images show ``board``, or if no board is recognised."""
     small = [_reduced(image)[0] for image in images]
     found = _recognised_tags(small) or _recognised_checkerboard(small)
     if found is None:
@@ -224,11 +219,8 @@ def _checkerboard(board: Board, image: Image) -> tuple[NDArray[np.int64], Array]
 
 
 def _reduced(image: Image) -> tuple[Image, float]:
-    """Reduce an image to a size at which OpenCV finds a checkerboard quickly.
-
-    Returns:
-        The reduced image, and the factor by which it was reduced.
-    """
+    """Reduce an image to a size at which OpenCV finds a checkerboard quickly. Returns the image and
+    the factor by which it was reduced."""
     times = max(1.0, max(image.shape) / _SEARCHED_PX)
     small = cv2.resize(image, None, None, 1 / times, 1 / times, cv2.INTER_AREA)
     return cast("Image", small), times
@@ -293,10 +285,7 @@ def _dictionary(name: str) -> Any:
 
 
 def _refined(board: Board, image: Image, view: View) -> View | None:
-    """Refine each corner to the intersection of the edges around it. Drop corners that move far.
-
-    The window around a corner is small enough that it contains no other edges.
-    """
+    """Refine each corner to the intersection of the edges around it. Drop corners that move far."""
     share = {  # half width of the window as a fraction of the distance between neighbouring corners
         "checkerboard": 0.3,
         "charuco": 0.4 * (1.0 - board.marker / board.square),
@@ -315,10 +304,8 @@ def _refined(board: Board, image: Image, view: View) -> View | None:
 
 
 def _recognised_checkerboard(images: Sequence[Image]) -> Board | None:
-    """Recognise a checkerboard that at least two images show.
-
-    Its squares are assumed to be 0.1 m wide.
-    """
+    """Recognise a checkerboard that at least two images show. Its squares are assumed to be 0.1 m
+    wide."""
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
     sizes: Counter[tuple[int, int]] = Counter()
     for image in images:
@@ -329,10 +316,8 @@ def _recognised_checkerboard(images: Sequence[Image]) -> Board | None:
 
 
 def _recognised_tags(images: Sequence[Image]) -> Board | None:
-    """Recognise a ChArUco board or AprilGrid, using the image that shows the most tags.
-
-    Its squares are assumed to be 0.1 m wide.
-    """
+    """Recognise a ChArUco board or AprilGrid, using the image that shows the most tags. Its squares
+    are assumed to be 0.1 m wide."""
     counts = [
         (len(_find_tags(image, *family, _TRIED_TAGS)[0]), image, family)
         for image, family in product(images, _FAMILIES)
@@ -354,9 +339,8 @@ def _recognised_tags(images: Sequence[Image]) -> Board | None:
 def _layout(
     kind: Kind, first: int, columns: int, family: str, numbers: NDArray[np.int64], xy: Array
 ) -> tuple[int, Board | None]:
-    """Fit a board with a given number of columns to the tags in an image.
-
-    It is assumed that tag 0 is in column ``first`` of the first row.
+    """Fit a board with a given number of columns to the tags in an image. It is assumed that tag 0
+    is in column ``first`` of the first row.
 
     Returns:
         The number of tags that fit, and the board; 0 and None if too few tags fit.

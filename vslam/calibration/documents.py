@@ -26,7 +26,8 @@ _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=\[)", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Document:
-    """A mapping (keys and values) in a YAML file.
+    """A mapping in a YAML file. Its methods raise an `InputError` if a key is missing or has
+    another type of value.
 
     Attributes:
         source: name of the file and of the section in it, for error messages.
@@ -47,29 +48,24 @@ class Document:
         return Document(f"{self.source}: {key}", values)
 
     def text(self, key: str) -> str:
-        """Return the value of a key, which must be a scalar, as text."""
+        """Return the scalar that is stored under a key, as text."""
         value = self._value(key)
         if not isinstance(value, str):
             raise InputError(f"{self.source}: {key} must be one word.")
         return value
 
     def number(self, key: str) -> float:
-        """Return the number that is stored under a key."""
         return self._numbers(key, "one number", 1)[0]
 
     def numbers(self, key: str, *counts: int) -> tuple[float, ...]:
-        """Return the numbers that are stored under a key, as a flat tuple.
-
-        If ``counts`` are given, the length of the tuple must be one of ``counts``.
-        """
+        """Return the numbers that are stored under a key, as a flat tuple. If ``counts`` are given,
+        its length must be one of them."""
         wanted = " or ".join(map(str, counts))
         return self._numbers(key, f"{wanted} numbers" if counts else "numbers", *counts)
 
     def matrix(self, key: str, rows: int, columns: int) -> Array:
-        """Return the ``(rows, columns)`` matrix that is stored under a key.
-
-        The value may be a list of rows, or a flat list of the numbers row by row.
-        """
+        """Return the ``(rows, columns)`` matrix that is stored under a key. The value may be a list
+        of rows, or a flat list of the numbers row by row."""
         found = self._numbers(key, f"{rows}x{columns} numbers", rows * columns)
         return np.array(found).reshape(rows, columns)
 
@@ -142,8 +138,8 @@ def _flat(value: object) -> list[str]:
     """Flatten nested lists of text to a single list.
 
     Nested YAML aliases can expand a few lines into gigabytes, or form a cycle. Therefore, a list
-    that has more items than any matrix is replaced with the text "no number". The caller rejects
-    this text.
+    that has more items than any matrix is replaced with the text "no number", which the caller
+    rejects.
     """
     found: list[str] = []
     waiting = [value]

@@ -52,7 +52,7 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
 
     Args:
         files: one file, one file for each camera (left first), or a folder that contains them.
-        size: width and height of the images. It is used if a file does not contain the image size.
+        size: width and height of the images, for files without an image size.
 
     Raises:
         InputError: a file or key is missing, the format or the camera model is unknown, or a number

@@ -47,11 +47,7 @@ _LONGEST_DELAY_S = 0.1  # longest delay between the two images of a pair
 
 
 def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Read vslam's own format.
-
-    The keys of this format are ``left``, ``right``, ``T_left_right`` or ``baseline``,
-    ``right_delay``, ``depth_scale`` and ``virtual_baseline``.
-    """
+    """Read vslam's own format, which docs/howto/cameras.md describes."""
     (document,) = documents
     _refuse_unknown(document, _OWN_KEYS)
     _refuse_contradictions(document)
@@ -75,7 +71,6 @@ def read_own(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 
 def _right_delay(document: Document) -> float:
-    """Read the delay of the right image after the left image in seconds; 0 if it is missing."""
     if "right_delay" not in document:
         return 0.0
     delay = document.number("right_delay")
@@ -89,11 +84,8 @@ def _right_delay(document: Document) -> float:
 
 
 def _refuse_contradictions(document: Document) -> None:
-    """Reject a file of vslam's own format whose keys contradict each other.
-
-    A stereo pair must have either ``T_left_right`` or ``baseline``, and no keys for depth. A single
-    camera must not have keys for a stereo pair.
-    """
+    """Reject a file of vslam's own format whose keys contradict each other. For example, a stereo
+    pair must not have both ``T_left_right`` and ``baseline``, or keys for depth."""
     of_pair, of_depth = ([k for k in keys if k in document] for keys in (_PAIR_KEYS, _DEPTH_KEYS))
     if {"T_left_right", "baseline"} <= set(of_pair):
         raise InputError(
@@ -113,10 +105,8 @@ def _refuse_contradictions(document: Document) -> None:
 
 
 def read_kalibr(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Read Kalibr's ``camchain.yaml``.
-
-    ``cam0`` is the left camera, and ``cam1`` is the right camera. ``cam1`` may be missing.
-    """
+    """Read Kalibr's ``camchain.yaml``. ``cam0`` is the left camera, and ``cam1``, which may be
+    missing, is the right camera."""
     (document,) = documents
     sections = [document.section(key) for key in ("cam0", "cam1") if key in document]
     models = [_named_camera(section, "distortion_coeffs", size) for section in sections]
@@ -131,10 +121,8 @@ def read_kalibr(documents: Sequence[Document], size: Size | None) -> Calibration
 
 
 def read_euroc(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Read EuRoC's ``sensor.yaml`` of one or two cameras.
-
-    ``T_BS`` maps points from the camera frame to the body frame.
-    """
+    """Read EuRoC's ``sensor.yaml`` of one or two cameras. ``T_BS`` maps points from the camera
+    frame to the body frame."""
     models = [_named_camera(document, "distortion_coefficients", size) for document in documents]
     if len(models) == 1:
         return Calibration(models[0], source=documents[0].source)
@@ -143,11 +131,8 @@ def read_euroc(documents: Sequence[Document], size: Size | None) -> Calibration:
 
 
 def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
-    """Read ROS's ``camera_info`` of one or two cameras.
-
-    The file contains either a printed message, or the output of ROS's package
-    ``camera_calibration``.
-    """
+    """Read ROS's ``camera_info`` of one or two cameras: a printed message, or the output of ROS's
+    package ``camera_calibration``."""
     found = [_ros_names(document) for document in documents]
     models = [_matrix_camera(d, d.source, "K", "D", _lens(d, "none"), size) for d in found]
     if len(models) == 1:
@@ -309,10 +294,8 @@ def _ros_names(document: Document) -> Document:
 
 
 def _lens(document: Document, unnamed: str = "") -> Lens:
-    """Return the kind of lens (pinhole or fisheye) of the distortion model that a file names.
-
-    If the file names no distortion model, the model ``unnamed`` is used.
-    """
+    """Return the kind of lens of the distortion model that a file names. If the name is empty, the
+    model ``unnamed`` is used."""
     word = document.text("distortion_model") or unnamed
     if word not in _LENSES:
         raise InputError(
@@ -323,10 +306,8 @@ def _lens(document: Document, unnamed: str = "") -> Lens:
 
 
 def _size_of(document: Document, size: Size | None, *keys: str) -> Size:
-    """Read the width and height of the images, which are stored under one or two keys.
-
-    If the file has no such key, ``size`` is returned.
-    """
+    """Read the width and height of the images, which are stored under one or two keys. If the file
+    has no such key, ``size`` is returned."""
     if keys[0] not in document and size is not None:
         return size
     width, height = document.numbers(keys[0], 2) if len(keys) == 1 else map(document.number, keys)
@@ -388,9 +369,8 @@ def _unrectified(R_left: Array, R_right: Array, P: Array, source: str) -> Array:
     """Compute ``T_left_right`` of the unrectified cameras from the matrices of the rectification.
 
     Args:
-        R_left: ``(3, 3)`` rotation of the left camera into the rectified frame.
-        R_right: ``(3, 3)`` rotation of the right camera into the rectified frame.
-        P: projection matrix of the rectified right camera.
+        R_left, R_right: ``(3, 3)`` rotations from each camera into the rectified frame.
+        P: ``(3, 4)`` projection matrix of the rectified right camera.
     """
     if P[0, 0] <= 0 or P[0, 3] == 0:
         raise InputError(

@@ -57,9 +57,8 @@ class Calibration:
 
     Attributes:
         left: the left camera, or the only camera.
-        right: the right camera; None for a single camera.
         T_left_right: ``(4, 4)`` float64. It maps points from the frame of the right camera to the
-            frame of the left camera. None if there is no right camera.
+            frame of the left camera.
         depth_scale: depth image units per metre; None if the file has none.
         virtual_baseline: baseline in metres that is used to convert depth to disparity; None if the
             file has none.
@@ -76,15 +75,14 @@ class Calibration:
     source: str = field(default="the calibration", compare=False)
 
     def left_alone(self) -> Calibration:
-        """Return the calibration of the left camera without the right camera."""
         return replace(self, right=None, T_left_right=None, right_delay=0.0)
 
 
 def project(model: CameraModel, rays: Array) -> Array:
     """Project ``(N, 3)`` points in the camera frame to ``(N, 2)`` float64 pixels.
 
-    The result is NaN for points that have no projection. A pinhole camera cannot project points
-    behind it. A fisheye camera cannot project points on the negative z axis.
+    The result is NaN for points that have no projection: points behind a pinhole camera, and points
+    on the negative z axis of a fisheye camera.
     """
     x, y, z = rays.T
     if model.lens == "fisheye":
@@ -101,13 +99,12 @@ def project(model: CameraModel, rays: Array) -> Array:
 
 
 def unproject(model: CameraModel, xy: Array) -> Array:
-    """Compute the viewing rays of ``(N, 2)`` pixels.
-
-    Returns ``(N, 3)`` float64 unit vectors in the camera frame.
+    """Compute the viewing rays of ``(N, 2)`` pixels, as ``(N, 3)`` float64 unit vectors in the
+    camera frame.
 
     The ray of a pixel is NaN if the distortion cannot be inverted there. This happens if Newton's
     method does not converge. It also happens if the distortion is not monotonic between the
-    principal point and the pixel, so that the image is folded there.
+    principal point and the pixel.
     """
     plane = (xy - (model.cx, model.cy)) / (model.fx, model.fy)
     if model.lens == "fisheye":
@@ -170,10 +167,7 @@ def _undistorted(distortion: tuple[float, ...], wanted: Array) -> Array:
 
 def _bent(distortion: tuple[float, ...], angle: Array) -> Array:
     """Return the distance from the principal point to the projection of a ray, in focal lengths.
-
-    Args:
-        angle: angle between the ray and the optical axis in radians.
-    """
+    ``angle`` is the angle between the ray and the optical axis, in radians."""
     k1, k2, k3, k4 = distortion
     a2 = angle * angle
     return angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
@@ -192,13 +186,11 @@ def _unbent(distortion: tuple[float, ...], radius: Array) -> Array:
 
 
 def _folds(reach: list[Array]) -> NDArray[np.bool_]:
-    """Return whether a distortion folds the image.
-
-    This is the case if a ray with a larger angle to the optical axis is projected closer to the
+    """Return whether a ray with a larger angle to the optical axis is projected closer to the
     principal point than a ray with a smaller angle.
 
     Args:
-        reach: distances from the principal point to the projections of rays. The rays are sorted by
+        reach: distances from the principal point to the projections of rays, which are sorted by
             increasing angle to the optical axis.
     """
     return np.any(~(np.diff(reach, axis=0) >= 0.0), axis=0)

@@ -1,13 +1,12 @@
 """Rectifies images: removes the distortion, and aligns the images of a stereo pair.
 
-The x axis of the rectified pair is the baseline. The viewing direction of the rectified pair is as
-close as possible to the mean viewing direction of the two cameras. The rectified images show the
-largest rectangle that both original images cover. The rectified images have no black border,
-because features on such a border would not move with the scene.
+The x axis of the rectified pair is the baseline. Its viewing direction is as close as possible to
+the mean viewing direction of the two cameras. The rectified images show the largest rectangle that
+both original images cover. They have no black border, because features on such a border would not
+move with the scene.
 
-OpenCV's functions are not used for this, because they can leave black corners.
-``cv2.stereoRectify`` estimates the rectangle from a 9x9 grid, and ``cv2.fisheye.stereoRectify``
-estimates it from four points.
+OpenCV's functions can leave black corners. ``cv2.stereoRectify`` estimates the rectangle from a 9x9
+grid, and ``cv2.fisheye.stereoRectify`` estimates it from four points.
 """
 
 from __future__ import annotations
@@ -36,17 +35,16 @@ _SAME_PX = 1e-3
 
 @dataclass(frozen=True)
 class Rectification:
-    """The functions that rectify the images of one camera or of a pair.
+    """The functions that rectify the images of one camera or of a pair. Several threads may call
+    them.
 
     Attributes:
         camera: the rectified camera or pair.
         R_left_rectified: ``(3, 3)`` float64. It maps directions from the frame of the rectified
-            left camera to the frame of the original left camera. Both frames have the same origin.
+            left camera to the frame of the original left camera.
         left: function that rectifies a left image, ``(H, W)`` uint8 of the calibrated size, by
-            bilinear interpolation. The result has the size of the left camera's images. An image
-            that needs no rectification is returned unchanged.
-        right: function that rectifies a right image in the same way. If there is no right camera,
-            the function returns images unchanged.
+            bilinear interpolation. The result has the size of the left camera's images.
+        right: the same for a right image. If there is no right camera, it returns images unchanged.
         left_depth: function that rectifies a depth image of any type by nearest-neighbour
             interpolation. The result is valid only if rectification does not rotate the camera,
             because depth is measured along the camera's axis.
@@ -63,8 +61,6 @@ class Rectification:
 
 def rectify(calibration: Calibration) -> Rectification:
     """Compute the rectification of a camera or a stereo pair.
-
-    The functions of the result may be called from several threads.
 
     Raises:
         InputError: the two cameras are not side by side, look in different directions or are
@@ -96,7 +92,6 @@ def rectify(calibration: Calibration) -> Rectification:
 
 
 def unchanged(image: Pixels) -> Pixels:
-    """Return the given image unchanged."""
     return image
 
 
@@ -127,11 +122,7 @@ def _is_rectified(
 
 
 def _between(R_left_right: Array, centre: Array, source: str) -> Array:
-    """Compute ``R_left_rectified``, the rotation from the rectified to the original left camera.
-
-    The x axis of the rectified frame is along the baseline. The z axis is as close as possible to
-    the mean viewing direction of the two cameras.
-    """
+    """Compute ``R_left_rectified``, the rotation from the rectified to the original left camera."""
     import cv2
 
     turn = cv2.Rodrigues(R_left_right)[0].ravel()
@@ -167,10 +158,8 @@ def _between(R_left_right: Array, centre: Array, source: str) -> Array:
 
 
 def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline: float) -> Camera:
-    """Return the pinhole camera with the widest field of view that all original images cover.
-
-    The pinhole camera has the image size of the left camera.
-    """
+    """Return the pinhole camera with the widest field of view that all original images cover. It
+    has the image size of the left camera."""
     bounds = np.array([_inner_rectangle(model, R, source) for model, R in cameras])
     (x0, y0), (x1, y1) = bounds[:, 0].max(axis=0), bounds[:, 1].min(axis=0)
     if x0 >= x1 or y0 >= y1:
@@ -192,9 +181,9 @@ def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline
 def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) -> Array:
     """Find a rectangle, on the plane z = 1 of the rectified camera, that the image fully covers.
 
-    Each side of the rectangle touches one border of the image. It touches this border at the pixel
-    that is nearest to the centre. Pixels that cannot be unprojected are ignored, because the
-    distortion polynomial of a wide lens may fold the corners of the image.
+    Each side of the rectangle touches one border of the image, at the pixel that is nearest to the
+    centre. Pixels that cannot be unprojected are ignored, because the distortion polynomial of a
+    wide lens may fold the corners of the image.
 
     Returns:
         ``[[x0, y0], [x1, y1]]``, two opposite corners of the rectangle.
@@ -213,10 +202,8 @@ def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) ->
 
 
 def _check_view(model: CameraModel, R_own_rectified: Array, camera: Camera, source: str) -> None:
-    """Check that the original image shows every part of the rectified view exactly once.
-
-    Raises an `InputError` if a part of the view is shown twice or not at all.
-    """
+    """Raise an `InputError` if the original image shows a part of the rectified view twice or not
+    at all."""
     xy = np.concatenate(_borders(camera.width, camera.height))
     rays = camera.backproject(xy, np.ones(len(xy))) @ R_own_rectified.T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -245,10 +232,7 @@ def _folded(source: str) -> InputError:
 
 
 def _maps(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:
-    """Compute where each rectified pixel lies in the original image.
-
-    Returns ``(H, W, 2)`` float32 positions in pixels.
-    """
+    """Return the ``(H, W, 2)`` float32 position of each rectified pixel in the original image."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack(
         [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
@@ -258,10 +242,8 @@ def _maps(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray
 
 
 def _linear(maps: NDArray[np.float32]) -> Callable[[Image], Image]:
-    """Make a function that warps an image bilinearly, with a resolution of 1/32 pixel.
-
-    The interpolation uses fixed-point numbers, which is three times as fast as floating point.
-    """
+    """Make a function that warps an image bilinearly, with a resolution of 1/32 pixel. The
+    fixed-point maps are three times as fast as floating-point maps."""
     import cv2
 
     fixed, weights = cv2.convertMaps(maps[..., 0], maps[..., 1], cv2.CV_16SC2)

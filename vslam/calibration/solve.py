@@ -1,4 +1,4 @@
-"""Estimates one camera, or two cameras and their transformation, from views of a board.
+"""Estimates one camera, or two cameras and the transformation between them, from views of a board.
 
 OpenCV estimates the cameras. This module selects views, drops views that do not fit, and measures
 residuals using vslam's own camera models. A *view* contains the corners of the board that one image
@@ -38,10 +38,8 @@ class CameraFit:
     """A camera that was estimated from V views of a board.
 
     Attributes:
-        model: the camera.
-        views: the V views.
-        residuals: ``(N, 2)`` float64 residuals of the N corners in each view, in pixels. A residual
-            is the position of a corner in the image minus the projected corner of the board.
+        residuals: ``(N, 2)`` float64 residuals of the N corners in each view, in pixels: the
+            position of a corner in the image minus the projected corner of the board.
         T_camera_board: ``(V, 4, 4)`` float64 pose of the board in each view.
         dropped: names of the views that were dropped because they do not fit, with their RMS errors
             in pixels.
@@ -79,10 +77,8 @@ class PairFit:
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimate of one camera, or of two cameras and the transformation between them.
-
-    The first camera is the left camera.
-    """
+    """The estimate of one camera, or of two cameras (left first) and the transformation between
+    them."""
 
     cameras: tuple[CameraFit, ...]
     pair: PairFit | None = None
@@ -105,12 +101,10 @@ def estimate(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], lens:
     """Estimate one camera, or a stereo pair if ``sizes`` has two entries.
 
     Args:
-        board: the board that the images show.
         frames: one view of the board for each image, or two views for each pair of images. In the
             two views of a pair, a corner must have the same number
             (`vslam.calibration.boards.same_order`).
         sizes: width and height of each camera's images.
-        lens: kind of lens, ``pinhole`` or ``fisheye``.
 
     Raises:
         InputError: a camera does not see the board, or `fit_camera` or `fit_pair` fails.
@@ -136,13 +130,9 @@ def estimate(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], lens:
 
 
 def diverse(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], n: int) -> list[Frame]:
-    """Select at most ``n`` frames in which the positions of the board differ most.
-
-    The frames are selected one after the other (farthest-point selection). In each step, the frame
-    is selected in which the outline of the board differs most from the outlines in the frames that
-    are already selected. If the board is at rest, only one frame is selected. Frames without the
-    board are left out.
-    """
+    """Select at most ``n`` frames in which the positions of the board differ most (farthest-point
+    selection). If the board is at rest, only one frame is selected. Frames without the board are
+    left out."""
     frames = [views for views in frames if any(views)]
     outlines = np.array(
         [[_outline(board, *seen) for seen in zip(views, sizes, strict=True)] for views in frames]
@@ -158,8 +148,8 @@ def diverse(board: Board, frames: Sequence[Frame], sizes: Sequence[Size], n: int
 def _outline(board: Board, view: View | None, size: Size) -> Array:
     """Return the four corners of the board's outline, as ``(8,)`` multiples of the image size.
 
-    The corners of the outline are computed by a homography, because some of them may be out of
-    view. They are clipped to half an image size beyond the image.
+    Corners that are out of view are extrapolated by a homography, and clipped to half an image size
+    beyond the image.
     """
     points = board_points(board)[:, :2]
     H = None if view is None else cv2.findHomography(points[view.ids], view.xy)[0]
@@ -172,9 +162,9 @@ def _outline(board: Board, view: View | None, size: Size) -> Array:
 def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> CameraFit:
     """Estimate a camera from views of a board.
 
-    The distortion of a pinhole camera has the coefficients ``k1 k2 p1 p2``. The distortion of a
-    fisheye camera has the coefficients ``k1 k2 k3 k4``. Views whose error exceeds three times the
-    median are dropped, and the camera is estimated again from the other views.
+    The distortion has the coefficients ``k1 k2 p1 p2`` (pinhole) or ``k1 k2 k3 k4`` (fisheye).
+    Views whose error exceeds three times the median are dropped, and the camera is estimated again
+    from the other views.
 
     Raises:
         InputError: the views are too few or too similar, or the corners are not those of this
@@ -230,9 +220,8 @@ def fit_camera(board: Board, views: Sequence[View], size: Size, lens: Lens) -> C
 
 
 def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
-    """Estimate the transformation between two cameras from pairs of views with the same name.
-
-    Pairs with large errors are dropped in the same way as `fit_camera` drops views.
+    """Estimate the transformation between two cameras from pairs of views with the same name. Pairs
+    with large errors are dropped in the same way as `fit_camera` drops views.
 
     Raises:
         InputError: fewer than three pairs remain.
@@ -276,11 +265,8 @@ def fit_pair(board: Board, left: CameraFit, right: CameraFit) -> PairFit:
 def _without_outliers(
     names: Sequence[str], fit: Callable[[Sequence[int]], _Fit], found_in: str, fix: str
 ) -> _Fit:
-    """Repeat a fit without the views that have large errors, until no error is large.
-
-    Raises:
-        InputError: too few views remain. ``found_in`` and ``fix`` are parts of the message.
-    """
+    """Repeat a fit without the views that have large errors, until no error is large. If too few
+    views remain, an `InputError` with the texts ``found_in`` and ``fix`` is raised."""
     kept = list(range(len(names)))
     dropped: list[tuple[str, float]] = []
     while len(kept) >= _FEWEST_VIEWS:

@@ -136,11 +136,8 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
 
 
 def _check_shapes(data: dict[str, NDArray]) -> dict[str, int]:
-    """Check that every array exists, is finite and has the right type and shape.
-
-    Returns:
-        The sizes of the arrays by name, such as the number of keyframes K.
-    """
+    """Check that every array exists, is finite and has the right type and shape. Returns the sizes
+    of the arrays by name, such as the number of keyframes K."""
     sizes: dict[str, int] = {}
     for name, (dtype, shape) in ARRAYS.items():
         array = data[name]
@@ -210,10 +207,8 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
 
 
 def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:
-    """Check the entries of landmarks that were merged into other landmarks.
-
-    Every chain of ``merged_into`` must end at a landmark that was not culled, or at -1.
-    """
+    """Check that every chain of ``merged_into`` ends at a landmark that was not culled, or at
+    -1."""
     n = len(merged_into)
     _check_ids("landmark_merged_into", merged_into, n, least=NONE)
     _require(bool((merged_into[alive] == NONE).all()), "a merged landmark that is not culled")

@@ -59,10 +59,8 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
 
 
 def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
-    """Return the data of a checkpoint that are not arrays, as a JSON object.
-
-    JSON preserves float64 numbers exactly.
-    """
+    """Return the data of a checkpoint that are not arrays, as a JSON object. JSON preserves float64
+    numbers exactly."""
     tracker, closing = checkpoint.tracker, checkpoint.closing
     consistency = closing.consistency
     return {

@@ -28,8 +28,8 @@ _TRACK = np.dtype([("image", "<u4"), ("point2d", "<u4")])
 class _Image(NamedTuple):
     """An image of COLMAP's sparse model.
 
-    ``pose`` is ``(7,)`` qw qx qy qz tx ty tz of ``T_cw``. ``points`` are the keypoints and have the
-    type ``_POINT2D``.
+    ``pose`` is ``(7,)`` qw qx qy qz tx ty tz of ``T_cw``. ``points`` are the keypoints, of type
+    ``_POINT2D``.
     """
 
     id: int
@@ -41,8 +41,8 @@ class _Image(NamedTuple):
 class _Point(NamedTuple):
     """A 3D point of COLMAP's sparse model.
 
-    ``error`` is the mean reprojection error in pixels. ``track`` lists the observations of the
-    point and has the type ``_TRACK``.
+    ``error`` is the mean reprojection error in pixels. ``track`` lists the observations, of type
+    ``_TRACK``.
     """
 
     id: int
@@ -60,10 +60,9 @@ def save_colmap(
     *,
     text: bool = False,
 ) -> None:
-    """Write a map as a sparse model in COLMAP's format.
-
-    The files are ``cameras.bin``, ``images.bin`` and ``points3D.bin``. With ``text``, they have the
-    extension ``.txt``. Only keypoints that observe a landmark are written.
+    """Write a map as a sparse model in COLMAP's format: ``cameras.bin``, ``images.bin`` and
+    ``points3D.bin``, or the same with ``.txt`` if ``text`` is True. Only keypoints that observe a
+    landmark are written.
 
     Args:
         folder: an existing folder, usually ``sparse/0`` of a COLMAP project.
@@ -108,10 +107,8 @@ def _parameters(camera: Camera) -> tuple[float, float, float, float]:
 
 
 def _write_binary(folder: Path, camera: Camera, images: list[_Image], points: list[_Point]) -> None:
-    """Write COLMAP's binary files.
-
-    The files are little-endian, as in COLMAP's ``reconstruction_io_binary.cc``.
-    """
+    """Write COLMAP's files in little-endian order, as in COLMAP's
+    ``reconstruction_io_binary.cc``."""
     (folder / "cameras.bin").write_bytes(
         struct.pack("<QIi2Q", 1, _CAMERA_ID, _PINHOLE, camera.width, camera.height)
         + struct.pack("<4d", *_parameters(camera))
@@ -150,8 +147,5 @@ def _write_text(folder: Path, camera: Camera, images: list[_Image], points: list
 
 
 def _words(values: tuple[float, ...] | list[float]) -> str:
-    """Format numbers as text, separated by spaces.
-
-    The numbers have enough digits to be read back exactly.
-    """
+    """Format numbers with enough digits to be read back exactly, separated by spaces."""
     return " ".join(map(repr, values))

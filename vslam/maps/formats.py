@@ -26,9 +26,8 @@ def save_nerfstudio(
     names: list[str],
     colours: NDArray[np.uint8],
 ) -> None:
-    """Write a data set for nerfstudio: ``transforms.json``, and the landmarks as ``sparse_pc.ply``.
-
-    The format is described at https://docs.nerf.studio/quickstart/data_conventions.html.
+    """Write a data set for nerfstudio: ``transforms.json``, and the landmarks as ``sparse_pc.ply``
+    (https://docs.nerf.studio/quickstart/data_conventions.html).
 
     Cameras look along -z with y up (OpenGL). ``transform_matrix`` is the pose of a camera (camera
     to world). The z axis of the world frame points up. ``applied_transform`` is the transformation
@@ -77,15 +76,15 @@ def save_g2o(
     T_i_j: NDArray[np.float64],
     sigmas: NDArray[np.float64],
 ) -> None:
-    """Write a pose graph in g2o's text format.
+    """Write a pose graph in g2o's text format
+    (https://github.com/RainerKuemmerle/g2o/wiki/File-Format).
 
-    The format is described at https://github.com/RainerKuemmerle/g2o/wiki/File-Format. Lines with
-    ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT`` contain x y z qx qy qz qw. An edge also has the upper
-    triangle of its information matrix, row by row, with the translation first.
+    Lines with ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT`` contain x y z qx qy qz qw. An edge also has
+    the upper triangle of its information matrix, row by row, with the translation first.
 
-    The information of rotations is per square radian. GTSAM, SE-Sync and the examples of Ceres
-    expect this unit. g2o itself uses qx qy qz as the error of a rotation. For small angles, this
-    error is half the angle. Therefore, rotations have only a quarter of their weight in g2o.
+    The information of rotations is per square radian, as GTSAM, SE-Sync and the examples of Ceres
+    expect. g2o itself uses qx qy qz as the error of a rotation, which is half the angle for small
+    angles. Therefore, rotations have only a quarter of their weight in g2o.
 
     Args:
         ids: ``(N,)`` ids of the vertices.
@@ -133,7 +132,6 @@ def save_ply(
     """Write points as binary PLY.
 
     Args:
-        path: the file.
         xyz: ``(N, 3)`` points in the world frame, in metres.
         colours: ``(N, 3)`` uint8 RGB colours of the points. None writes no colours.
     """
@@ -156,10 +154,7 @@ def save_ply(
 
 
 def save_image(image: NDArray[np.uint8], path: Path) -> None:
-    """Write an image as PNG.
-
-    Args:
-        image: ``(H, W)`` grey or ``(H, W, 3)`` RGB image.
+    """Write an ``(H, W)`` grey or ``(H, W, 3)`` RGB image as PNG.
 
     Raises:
         OSError: the file cannot be written.
@@ -175,9 +170,8 @@ def save_image(image: NDArray[np.uint8], path: Path) -> None:
 def landmark_colours(
     reconstruction: Reconstruction, images: Iterable[NDArray[np.uint8]]
 ) -> NDArray[np.uint8]:
-    """Return the RGB colour of each landmark as ``(L, 3)`` uint8.
-
-    The colour of a landmark is taken from its observation with the median brightness.
+    """Return the RGB colour of each landmark as ``(L, 3)`` uint8, taken from its observation with
+    the median brightness.
 
     Args:
         images: ``(H, W)`` grey or ``(H, W, 3)`` RGB image of each keyframe, in order.

@@ -14,10 +14,8 @@ from vslam.errors import InputError, ResultsError
 
 @contextmanager
 def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
-    """Yield the path of a temporary file or folder, to which the output is written.
-
-    If the block succeeds, the temporary file or folder is renamed to ``path``. If the block raises
-    an exception, the temporary file or folder is removed.
+    """Yield the path of a temporary file or folder for the output. The temporary file or folder is
+    renamed to ``path`` if the block succeeds, and removed if the block raises an exception.
 
     Raises:
         InputError: ``path`` exists already. If a folder is written, an existing empty folder is
@@ -46,10 +44,8 @@ def new_output(path: Path, *, folder: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[BinaryIO]:
-    """Yield the path of a temporary file, which replaces ``path`` atomically at the end.
-
-    Before it replaces ``path``, the temporary file is synced to the disk. After an error, ``path``
-    is unchanged.
+    """Yield a temporary file, open for writing. At the end, the file is synced to the disk and
+    replaces ``path`` atomically. After an error, ``path`` is unchanged.
 
     Raises:
         OSError: the file cannot be written, for example because the disk is full.
@@ -81,7 +77,6 @@ def require_place(path: Path, option: str) -> None:
     """Check that a file can be written to a path. Call this before a long computation.
 
     Args:
-        path: the path.
         option: the option that gave the path, for error messages.
 
     Raises:
@@ -94,19 +89,12 @@ def require_place(path: Path, option: str) -> None:
 
 
 def require_free(path: Path) -> None:
-    """Check that ``path``, the value of ``--out``, does not exist.
-
-    Raises:
-        InputError: a file or folder exists at ``path``.
-    """
+    """Raise an `InputError` if a file or folder exists at ``path``, the value of ``--out``."""
     if os.path.lexists(path):
         raise InputError(f"{path}: exists already; remove it, or give another path with --out.")
 
 
 def _beside(path: Path) -> Path:
-    """Return a hidden path in the same folder as ``path``.
-
-    Both paths are on the same file system, so that renaming is atomic.
-    """
+    """Return a hidden path in the same folder as ``path``, so that renaming is atomic."""
     path = path.absolute()
     return path.with_name(f".{path.name}.{os.getpid()}.part")

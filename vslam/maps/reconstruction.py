@@ -18,16 +18,14 @@ PIXEL_CENTRE = 0.5
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """The keyframes, landmarks and observations of a map, without culled entries.
-
-    There are K keyframes, L landmarks and N observations. Keyframes and landmarks are numbered
-    without gaps. All observations are features of left images.
+    """The K keyframes, L landmarks and N observations of a map, without culled entries. Keyframes
+    and landmarks are numbered without gaps. All observations are features of left images.
 
     Attributes:
         camera: camera of all keyframes. The centre of the upper left pixel is (0, 0), as in OpenCV.
         frames: ``(K,)`` int64, index of the frame that became each keyframe.
         timestamps: ``(K,)`` float64 seconds.
-        T_cw: ``(K, 4, 4)`` float64 poses.
+        T_cw: ``(K, 4, 4)`` float64 poses (world to camera).
         xyz: ``(L, 3)`` float64 positions in the world frame. Each landmark is observed at least
             once.
         keyframe, landmark: ``(N,)`` int64, the index of the keyframe and the index of the landmark
@@ -50,12 +48,11 @@ class Reconstruction:
         return inverses(self.T_cw)
 
     def observations_of(self, keyframe: int) -> slice:
-        """Return the indices of the observations of a keyframe, as a slice."""
         first, last = np.searchsorted(self.keyframe, [keyframe, keyframe + 1])
         return slice(int(first), int(last))
 
     def reprojection_errors(self) -> NDArray[np.float64]:
-        """Return the reprojection error of each observation as ``(N,)`` distances in pixels."""
+        """Return the ``(N,)`` reprojection errors of the observations, in pixels."""
         T_cw = self.T_cw[self.keyframe]
         p_c = np.einsum("nij,nj->ni", T_cw[:, :3, :3], self.xyz[self.landmark]) + T_cw[:, :3, 3]
         return np.linalg.norm(self.camera.project(p_c)[:, :2] - self.xy, axis=1)

@@ -72,8 +72,8 @@ class FramePose:
     def of(cls, result: TrackResult, stamp: int) -> FramePose:
         """Create the pose of a frame from the result of ``Slam.step``.
 
-        ``stamp`` is given in nanoseconds, because ROS looks up transforms by exact times. Unix time
-        in float64 seconds has a resolution of only 0.2 us.
+        ``stamp`` is in nanoseconds, because ROS looks up transforms by exact times. Unix time in
+        float64 seconds has a resolution of only 0.2 us.
         """
         uncertainty, T = result.uncertainty, result.T_odom_camera
         return cls(
@@ -91,20 +91,17 @@ class FramePose:
 
 
 def in_ros_axes(T: Matrix) -> Matrix:
-    """Convert transformations between camera frames to the axes of ROS (x forward, z up).
-
-    ``T`` and the result have the shape ``(..., 4, 4)``.
-    """
+    """Convert ``(..., 4, 4)`` transformations between camera frames to the axes of ROS (x forward,
+    z up)."""
     result: Matrix = T_BASE_OPTICAL @ T @ T_BASE_OPTICAL.T
     return result
 
 
 def odometry_message(types: Types, pose: FramePose, before: FramePose | None) -> Any:
-    """Create ``nav_msgs/Odometry`` with the pose and the mean velocity of ``base_link``.
+    """Create ``nav_msgs/Odometry`` with the pose of ``base_link`` in the frame ``odom``.
 
-    The pose is given in the frame ``odom``. The velocity is given in the axes of ``base_link``. It
-    is the mean velocity between the earlier frame ``before`` and this frame. If ``before`` is None,
-    the velocity is zero.
+    The velocity is in the axes of ``base_link``. It is the mean velocity since the earlier frame
+    ``before``, or zero if ``before`` is None.
     """
     twist, R = np.zeros(6), T_BASE_OPTICAL[:3, :3]
     if before is not None:
@@ -153,10 +150,8 @@ def path_message(types: Types, trajectory: Trajectory) -> Any:
 
 
 def points_message(types: Types, stamp: int, xyz: NDArray[np.float64]) -> Any:
-    """Create ``sensor_msgs/PointCloud2`` in the frame ``map``.
-
-    ``xyz`` are ``(N, 3)`` points in the world frame of vslam.
-    """
+    """Create ``sensor_msgs/PointCloud2`` in the frame ``map`` from ``(N, 3)`` points in the world
+    frame of vslam."""
     points = (xyz @ T_BASE_OPTICAL[:3, :3].T).astype("<f4")
     fields = [
         types("sensor_msgs/msg/PointField")(name=name, offset=4 * k, datatype=_FLOAT32, count=1)
@@ -276,9 +271,8 @@ def frame_poses(
 
 
 def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
-    """Convert a covariance to the axes of ROS.
-
-    The axes of ``[x, y, z, rx, ry, rz]`` are rotated by ``R``. The result is ``(36,)``, row by row.
+    """Rotate the axes of a covariance of ``[x, y, z, rx, ry, rz]`` by ``R``. Returns ``(36,)``, row
+    by row.
 
     An unknown covariance (None) becomes all zeros, which is the convention of ``sensor_msgs``.
     """
@@ -290,11 +284,11 @@ def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
 
 
 def _velocity_covariance(pose: FramePose, before: FramePose | None) -> Matrix | None:
-    """Return the ``(6, 6)`` covariance of the mean velocity between two frames.
+    """Return the ``(6, 6)`` covariance of the mean velocity between two frames, in the frame of the
+    camera.
 
-    The covariance is given in the frame of the camera. The errors of the two poses relative to the
-    landmarks are independent. The error in the positions of the landmarks is the same for both
-    poses, and therefore cancels.
+    The errors of the two poses relative to the landmarks are independent. The error in the
+    positions of the landmarks is the same for both poses, and therefore cancels.
     """
     if before is None or before.near is None or pose.near is None:
         return None

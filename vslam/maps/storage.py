@@ -1,8 +1,7 @@
 """Reads and writes map files. A map file is an ``.npz`` file.
 
-A map file is written atomically, and it is checked when it is read. The arrays are not compressed,
-for two reasons. First, most of the data are descriptors, which do not compress well. Second, a map
-should load within a second.
+A map file is written atomically, and it is checked when it is read. The arrays are not compressed.
+Most of the data are descriptors, which do not compress well, and a map should load within a second.
 """
 
 from __future__ import annotations
@@ -34,20 +33,18 @@ _FOREIGN = "not a map of vslam; give a map.npz or the folder of a run"
 
 
 def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) -> None:
-    """Write a map to a file. An existing file is replaced.
+    """Write a map to a file. An existing file is replaced. After an error or a power cut, it is
+    unchanged.
 
-    After an error or a power cut, an existing file is unchanged. The file contains the JSON text
-    ``header`` with the schema, camera, detector, drives, thresholds and versions. It also contains
-    the arrays of ``ARRAYS``. The data of the loop detector for each keyframe (``PerKeyframe``) are
-    stored as ``detector_NAME_first`` and ``detector_NAME_values``. The images of the keyframes are
-    stored as ``image_first`` and ``image_values``. Observations are sorted by landmark. The
-    observations of a landmark are stored in the order of its linked list.
+    The file contains the JSON text ``header`` and the arrays of ``checked_map.ARRAYS``. The data of
+    the loop detector for each keyframe (``PerKeyframe``) are stored as ``detector_NAME_first`` and
+    ``detector_NAME_values``. The images of the keyframes are stored as ``image_first`` and
+    ``image_values``. Observations are sorted by landmark. The observations of a landmark are in the
+    order of its linked list.
 
     Args:
-        path: the file.
-        stored: the map.
-        resumable: if True, culled keyframes and landmarks are also written, and the checkpoint if
-            there is one. If False, culled keyframes and landmarks are left out.
+        resumable: if True and the map has a checkpoint, the checkpoint is written, and culled
+            keyframes and landmarks are kept.
 
     Raises:
         OSError: the file cannot be written.
@@ -61,8 +58,6 @@ def save_map(path: Path | str, stored: StoredMap, *, resumable: bool = False) ->
 def load_map(path: Path | str) -> StoredMap:
     """Read a map from a file, and remove culled keyframes and landmarks.
 
-    All properties of the arrays that compiled kernels rely on are checked.
-
     Raises:
         InputError: the file is missing or damaged, is not a map, or has another schema version.
     """
@@ -71,10 +66,8 @@ def load_map(path: Path | str) -> StoredMap:
 
 
 def load_checkpoint(path: Path | str) -> StoredMap:
-    """Read a map from which a run can be resumed.
-
-    If the map has a checkpoint, culled keyframes and landmarks are kept. Otherwise, they are
-    removed. All properties of the arrays that compiled kernels rely on are checked.
+    """Read a map from which a run can be resumed. Culled keyframes and landmarks are kept if the
+    map has a checkpoint. All properties of the arrays that compiled kernels rely on are checked.
 
     Args:
         path: a map file, or the folder of a run that has a map file.
@@ -160,10 +153,8 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
 
 
 def map_file_of(path: Path | str) -> Path:
-    """Return the path of the map file in the folder of a run.
-
-    Any other path is returned unchanged.
-    """
+    """Return the path of the map file in the folder of a run. Any other path is returned
+    unchanged."""
     path = Path(path)
     return path / "map.npz" if path.is_dir() else path
 
@@ -189,7 +180,6 @@ def made_with(path: Path | str) -> MadeWith:
 
 
 def _read(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
-    """Read all arrays of a map file, and its header."""
     with _opened(path) as (file, header):
         return {name: file[name] for name in file.files if name != "header"}, header
 

@@ -1,7 +1,4 @@
-"""A map with all data that a later run needs to continue the map.
-
-Culled keyframes and landmarks have been removed, except in a map with a checkpoint.
-"""
+"""A map with all data that a later run needs to continue the map."""
 
 from __future__ import annotations
 
@@ -37,8 +34,8 @@ class TruthAlignment:
     Attributes:
         name: name of the data set and the sequence of the ground truth.
         S_truth_world: ``(4, 4)`` transformation from the world frame of the map to the world frame
-            of the ground truth. This transformation aligns the trajectory of the first drive with
-            the ground truth. It is a rigid motion, or a similarity for a monocular map.
+            of the ground truth. It aligns the trajectory of the first drive. It is a rigid motion,
+            or a similarity for a monocular map.
     """
 
     name: str
@@ -50,8 +47,8 @@ class StoredMap:
     """The content of a map file.
 
     Attributes:
-        map: keyframes, landmarks and observations.
-        camera: camera of all keyframes.
+        map: keyframes, landmarks and observations. Culled entries have been removed, except in a
+            map with a checkpoint.
         loops: closed loops, without features and landmarks. Their translations are in the current
             unit of the map.
         detector: data that the loop detector has stored about the keyframes.
@@ -63,8 +60,8 @@ class StoredMap:
         truth_alignment: the transformation from the map to the frame of a ground truth. None
             without ground truth.
         checkpoint: state from which the last drive continues with the same results as an
-            uninterrupted run. A map with a checkpoint includes culled keyframes and landmarks, with
-            unchanged ids. None if the map has no culled entries or if no checkpoint was possible.
+            uninterrupted run. None if the map has no culled entries or if no checkpoint was
+            possible.
     """
 
     map: Map
@@ -92,9 +89,8 @@ class StoredMap:
         return self.select(self.map.living_keyframes(), copy=copy)
 
     def select(self, keyframes: NDArray[np.int64], *, copy: bool = True) -> StoredMap:
-        """Copy a part of the map: some keyframes, and the landmarks that they observe.
-
-        Keyframes and landmarks are numbered without gaps.
+        """Copy a part of the map: some keyframes, and the landmarks that they observe. Both are
+        numbered without gaps.
 
         Args:
             keyframes: ``(K,)`` ids of keyframes that were not culled, in ascending order. The poses
@@ -126,13 +122,15 @@ class StoredMap:
 
 
 def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> Map:
-    """Copy a part of a map: some keyframes, and the landmarks that they observe.
+    """Copy a part of a map: some keyframes, and the landmarks that they observe. Both are numbered
+    without gaps.
 
-    The ids of the keyframes are given as ``(K,)``, in ascending order. These keyframes must not
-    have been culled. In the copy, keyframes and landmarks are numbered without gaps.
+    The parent of a keyframe is its nearest selected ancestor, or the first selected keyframe if no
+    ancestor is selected.
 
-    The parent of a keyframe is its nearest selected ancestor. If no ancestor is selected, it is the
-    first selected keyframe.
+    Args:
+        keyframes: ``(K,)`` ids of keyframes that were not culled, in ascending order.
+        copy: see ``StoredMap.select``.
     """
     a, n = map_.arrays, len(keyframes)
     new_id = np.full(map_.n_keyframes, NONE, np.int64)
@@ -193,8 +191,7 @@ def observations(
     Args:
         rows: ``(O,)`` indices of the keypoints that observe the landmarks, sorted by landmark. Each
             keypoint occurs at most once.
-        first: ``(L + 1,)`` offset of each landmark in ``rows``. No keypoint observes a culled
-            landmark.
+        first: ``(L + 1,)`` offset of each landmark in ``rows``.
         u_right: ``(R,)`` column of the stereo match of each keypoint, in the right image. NaN for a
             keypoint without a stereo match.
     """
@@ -220,10 +217,8 @@ def observations(
 
 
 def appended(one: StoredMap, other: StoredMap) -> StoredMap:
-    """Append a map to another map, as a sub-map at an unknown pose.
-
-    Neither of the two maps may contain culled keyframes or landmarks.
-    """
+    """Append a map to another map, as a sub-map at an unknown pose. Neither map may contain culled
+    keyframes or landmarks."""
     a, b = one.map, other.map
     n, drives = a.n_keyframes, a.scalars.session + 1
     shift = {
@@ -293,10 +288,7 @@ def _spanning_tree(
 
 
 def _renumbered(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> FrameTable:
-    """Convert the poses of frames so that they are relative to keyframes that were not culled.
-
-    The result refers to these keyframes by their new ids.
-    """
+    """Convert the poses of frames so that they are relative to keyframes that were not culled."""
     reference = frames.reference.copy()
     T_c_reference, unit = frames.T_c_reference.copy(), frames.unit_scale.copy()
     table = map_.keyframes
@@ -314,9 +306,7 @@ def _renumbered(frames: FrameTable, map_: Map, new_id: NDArray[np.int64]) -> Fra
 
 def in_box(map_: Map, box: Sequence[float]) -> NDArray[np.int64]:
     """Return the ids of the keyframes in a box, in ascending order, without culled keyframes.
-
-    ``box`` is the range of x followed by the range of z, in metres.
-    """
+    ``box`` is the range of x followed by the range of z, in metres."""
     keyframes, xz = _places(map_)
     low, high = np.array(box).reshape(2, 2).T
     return keyframes[((xz >= low) & (xz <= high)).all(axis=1)]
@@ -326,7 +316,6 @@ def near_point(map_: Map, point: Sequence[float], within: float) -> NDArray[np.i
     """Return the ids of the keyframes near a point, in ascending order, without culled keyframes.
 
     Args:
-        map_: the map.
         point: x and z in metres.
         within: largest distance in metres.
     """
@@ -337,10 +326,11 @@ def near_point(map_: Map, point: Sequence[float], within: float) -> NDArray[np.i
 def near_frames(
     map_: Map, drive: int, first: float, last: float, within: float
 ) -> NDArray[np.int64]:
-    """Return the ids of the keyframes near some frames of a drive, without culled keyframes.
+    """Return the ids of the keyframes near some frames of a drive, in ascending order, without
+    culled keyframes.
 
-    A keyframe is included if it is at most ``within`` metres from any keyframe that was made from
-    the frames ``first`` to ``last``. The ids are in ascending order.
+    A keyframe is included if it is at most ``within`` metres from a keyframe that was made from the
+    frames ``first`` to ``last``.
     """
     from scipy.spatial import cKDTree
 

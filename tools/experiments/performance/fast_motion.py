@@ -4,8 +4,8 @@
       --source "--dataset kitti --data $KITTI_ROOT --seq 00 --max-frames 216"
 
 A source is a list of options of ``vslam run``. Each run is made twice: with the attempt to find the
-pose after a sudden turn (``track_sudden_motion``), and without this attempt. The table has a row for
-each pair of runs.
+pose after a sudden turn (``track_sudden_motion``), and without this attempt. The table has a row
+for each pair of runs.
 """
 
 from __future__ import annotations

@@ -40,7 +40,6 @@ class Passes:
         self._pools = lamp_pools(town.lamps)
 
     def at(self, frame: int) -> Moment:
-        """Return the scene of the town at a frame of the route."""
         number = int(np.searchsorted(self._starts, frame, side="right")) - 1
         light, night = self._light(frame, number)
         standing = self._standing(frame)
@@ -68,9 +67,8 @@ class Passes:
     def _light(self, frame: int, number: int) -> tuple[Light, float]:
         """Return the light at a frame of pass ``number``, and the darkness (0 by day, 1 at night).
 
-        A pass is a part of the drive in which no street is revisited. The sun does not move during
-        a pass. Between two passes, the sun moves while a cloud hides it. Night falls slowly during
-        the whole drive.
+        A pass is a part of the drive in which no street is revisited. The sun moves only between
+        two passes, while a cloud hides it. Night falls slowly during the whole drive.
         """
         seed, change = self._variation.seed, self._variation.change
         rng = np.random.default_rng([seed, 11])
@@ -98,10 +96,7 @@ class Passes:
         return light, night
 
     def _cars(self, frame: int) -> list[Surfaces]:
-        """Return the surfaces of the moving cars at a frame.
-
-        The first car drives ahead of the camera. The other cars approach on the other lane.
-        """
+        """The first moving car is ahead of the camera. The others approach on the other lane."""
         T_wc = self._route.T_wc
         here, cars = T_wc[frame], []
         for k, model in enumerate(self._town.moving):

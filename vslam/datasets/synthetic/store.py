@@ -93,7 +93,6 @@ def list_stored(cache: Path) -> list[Stored]:
 
 
 def _folder_size(folder: Path) -> int:
-    """Return the total size of the files in a folder in bytes."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
@@ -103,11 +102,7 @@ def place_folder(cache: Path) -> Path:
 
 
 def clean(cache: Path, name: str | None = None) -> int:
-    """Remove the whole cache, or all variations of the route ``name``.
-
-    Returns:
-        The number of freed bytes.
-    """
+    """Remove the whole cache, or all variations of the route ``name``. Return the freed bytes."""
     freed = 0
     for places in cache.glob("v*-places") if name is None else []:
         freed += _folder_size(places)
@@ -131,12 +126,11 @@ def render_sequence(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> Path:
-    """Render the missing frames of a route, and return the folder of the sequence.
+    """Render the missing frames of a route in KITTI's format. Return the folder of the data set.
 
-    Damaged frames are rendered again, and a warning is logged. The folder has KITTI's format.
+    Damaged frames are rendered again, and a warning is logged.
 
     Args:
-        route: route to render.
         variation: variation of the town.
         cache: folder of the rendered sequences (`cache_folder`).
         depth: whether to write ``depth_0``, too. It contains the depth of the left camera in
@@ -224,7 +218,7 @@ def render_frames(
     """Render frames of a route into the folder of a sequence.
 
     Args:
-        depth, threads: whether depth is written, and how many frames are rendered in parallel.
+        threads: number of frames that are rendered in parallel.
         on_frame: called with the number of finished frames and ``total``.
         total: number of frames of the sequence. Frames that are not rendered count as finished.
         monocular: render only the left images.

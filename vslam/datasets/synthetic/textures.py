@@ -20,14 +20,11 @@ _LETTERS = np.array(list("ABCDEFGHIKLMNOPRSTUVWZ0123456789"))
 
 
 def noise(rng: Rng, height: int, width: int, cell: float, octaves: int = 4) -> Grey:
-    """Make tileable band-limited noise with zero mean and unit variance.
+    """Make ``(height, width)`` float32 tileable noise with zero mean and unit variance.
 
     Args:
         cell: cell size of the coarsest grid in texels. Each octave has half the cell size and 0.7
             of the contrast of the octave before.
-
-    Returns:
-        ``(height, width)`` float32.
     """
     total = np.zeros((1, 1), np.float32)
     for octave in range(octaves):
@@ -55,7 +52,6 @@ def detail(rng: Rng, contrast: float, cell: float = 8.0, size: int = 256) -> Gre
 
 
 def letters(rng: Rng, low: int = 3, high: int = 9) -> str:
-    """Return a random word."""
     return "".join(rng.choice(_LETTERS, int(rng.integers(low, high))))
 
 

@@ -67,8 +67,6 @@ def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0
     """Build the town of a route.
 
     Args:
-        route: route along which the town is built.
-        variation: variation of the town.
         aside: lateral shifts of the camera in metres, to the right. The space at these positions is
             kept free.
     """
@@ -112,7 +110,6 @@ def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0
 
 
 def _with_side_streets(roads: Roads, seed: int) -> Roads:
-    """Add short side streets to the roads of the route."""
     rng = np.random.default_rng([seed, 2])
     tree, stubs = cKDTree(roads.xz), []
     at = int(rng.integers(120, 240))
@@ -178,7 +175,7 @@ def _try_house(
 
 
 def _size(site: Site, rng: Rng) -> tuple[float, float, float]:
-    """Draw width, height and depth of a house in metres."""
+    """Draw the width, height and depth of a house in metres."""
     if site.variation.aliased:
         rng = np.random.default_rng([site.variation.seed, 6, site.next_thing % ALIASES])
     if site.route.land == "town":
@@ -189,7 +186,6 @@ def _size(site: Site, rng: Rng) -> tuple[float, float, float]:
 
 
 def line_with_houses(site: Site) -> None:
-    """Build houses along both sides of every road."""
     roads, rng, town = site.roads, site.rng, site.route.land == "town"
     for side in (-1.0, 1.0):
         at, setback = 0, site.style.walk + (2.0 if town else 6.0)

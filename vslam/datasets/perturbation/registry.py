@@ -23,11 +23,10 @@ _PROBE = (48, 64)  # rows and columns of the image on which a new law is tried
 
 
 def plugin_laws() -> dict[str, Callable[[float, tuple[int, int]], PlugInLaw]]:
-    """Return the laws (kinds of perturbation) that plug-ins in other Python packages define.
+    """Return the laws (kinds of perturbation) of plug-ins in other Python packages, by name.
 
-    Returns:
-        A function for each name of a law. The function takes a strength and a random stream
-        (`RandomStream`), and returns the perturbation.
+    Each is a function that takes a strength and a random stream (`RandomStream`), and returns the
+    perturbation.
     """
     return {name: partial(_make, plugin) for name, plugin in find_plugins(PERTURBATIONS).items()}
 
@@ -50,7 +49,7 @@ def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> PlugInLaw
 
 
 def _apply(plugin: PlugIn, law: PlugInLaw, frame: int, t: float, side: int, image: Image) -> Image:
-    """Apply a perturbation of a plug-in to an image.
+    """Apply a perturbation of a plug-in to an image, and check the result.
 
     Raises:
         UnreadableImageError: the perturbation fails, or does not return an image of the same size.

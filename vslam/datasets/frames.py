@@ -265,7 +265,7 @@ def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]
 
 
 def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
-    """Yield the frames of a source that have the given indices, which must increase.
+    """Yield the frames of a source with the given indices. The indices must increase.
 
     If the source ends earlier, fewer frames are yielded.
     """

@@ -69,7 +69,7 @@ def open_kitti(
             f"download the grayscale images (22 GB) from {_HOME}."
         )
     chosen = select_frames(folder, len(stems), start, every, max_frames)
-    sides = _check_frames(folder, listed, [stems[k] for k in chosen])
+    sides = _files_of_frames(folder, listed, [stems[k] for k in chosen])
     times = _read_times(folder / "times.txt")
     frames = _row_numbers(folder / "times.txt", stems, len(times))[chosen]
     truth = _read_ground_truth(base / "poses" / f"{name}.txt", stems, len(times), chosen)
@@ -95,7 +95,7 @@ def open_kitti(
 
 
 def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
-    """List all sequences with their names and their numbers of left and right images.
+    """List the name of each sequence, and its numbers of left and right images.
 
     Raises:
         InputError: ``root`` holds no KITTI data.
@@ -181,14 +181,9 @@ def _by_number(stem: str) -> tuple[int, str]:
     return (int(stem) if stem.isdecimal() else -1, stem)
 
 
-def _check_frames(
+def _files_of_frames(
     folder: Path, sides: list[dict[str, Path]], stems: list[str]
 ) -> list[tuple[Path, ...]]:
-    """Return the image files of the frames ``stems`` for each camera.
-
-    Raises:
-        InputError: a camera has no images, or an image of a frame is missing.
-    """
     for side, images in enumerate(sides):
         if not images:
             instead = ", or run on the left camera alone with --sensor mono" if side else ""

@@ -103,7 +103,6 @@ def _queue(dai: Any, pipeline: Any, sensor: str) -> Any:
 
 
 def _calibration(dai: Any, device: Any, images: Any, sensor: str) -> Calibration:
-    """Read the calibration from the memory of the device and from its first images."""
     socket, memory = dai.CameraBoardSocket, device.readCalibration()
     source = f"the calibration in oakd {device.getDeviceId()}"
     left = _model(images["left"], source)

@@ -56,11 +56,7 @@ def decode_png(data: bytes) -> NDArray[np.uint8] | None:
 
 
 def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
-    """Read the height, the width and the compressed image data of a PNG file.
-
-    Raises:
-        ValueError, struct.error: the file has a different format, or is damaged.
-    """
+    """Read the height, the width and the compressed image data of a PNG file."""
     chunks = _chunks(data)
     kind, header = next(chunks, (b"", b""))
     width, height, *form = struct.unpack(">II5B", header)
@@ -78,11 +74,7 @@ def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield the kind and the contents of every chunk of a PNG file except the last chunk.
-
-    Raises:
-        ValueError, struct.error: the file is truncated, or a checksum is wrong.
-    """
+    """Yield the kind and the contents of every chunk of a PNG file except the last chunk."""
     import deflate
 
     if not data.startswith(SIGNATURE):

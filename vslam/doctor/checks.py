@@ -45,10 +45,10 @@ LONG_GAP = 3.5  # a longer step, in intervals, means that several frames in a ro
 DEPTH_PX = 4.0  # largest shift; depth edges of structured light are off by 2 to 3 px
 DEPTH_SHARE = 0.3  # smallest share of pixels with a depth
 # Misregistered depth is reported only if the fit has one clear peak away from shift 0. Heights are
-# measured above the median of the fit, relative to the highest peak. For correct depth, in nine
-# parts of TUM fr1/desk, the height near shift 0 is at least 0.67, or the height of the second peak
-# is 0.85. If the depth is shifted by 20 px, the height near shift 0 is 0.25 to 0.66. The height of
-# the second peak is then mostly 0.65 to 0.77.
+# measured above the median of the fit, relative to the highest peak. The limits were measured in
+# nine parts of TUM fr1/desk. With correct depth, the height near shift 0 was at least 0.67, or the
+# second peak had the height 0.85. With depth that was shifted by 20 px, the height near shift 0 was
+# 0.25 to 0.66. The height of the second peak was then mostly 0.65 to 0.77.
 DEPTH_AT_ZERO = 0.6
 DEPTH_SECOND = 0.8
 _ANOTHER_PX = 8.0  # smallest distance of the second peak from the highest peak

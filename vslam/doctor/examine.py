@@ -133,7 +133,7 @@ class _Pair:
         return float(np.median(np.abs(self.matches.left[:, 1] - self.matches.right[:, 1])))
 
 
-def _pairs(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
+def _pairs_with_lag(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
     """Match each left image with the right image that was taken ``lag`` frames later."""
     found = []
     for frame, left in lefts.items():
@@ -151,7 +151,7 @@ def _examine_stereo(
     sequence: Source, lefts: dict[int, Image], *, few_features: bool
 ) -> tuple[list[Finding], list[Picture]]:
     inner = dict(list(lefts.items())[1:-1:2])  # frames that have frames before and after them
-    by_lag = {lag: _pairs(sequence, inner if lag else lefts, lag) for lag in _LAGS}
+    by_lag = {lag: _pairs_with_lag(sequence, inner if lag else lefts, lag) for lag in _LAGS}
     pairs = by_lag[0]
     if not any(len(pair.matches) for pair in pairs):
         fix = "the images do not overlap: check that they form a pair, and their calibration"

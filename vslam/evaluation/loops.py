@@ -113,7 +113,7 @@ def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
 
 
 def metres_per_unit(T_wc: Poses, T_wc_true: Poses) -> NDArray[np.float64]:
-    """Return the length in metres of the unit of a monocular map at each of N frames, ``(N,)``.
+    """Return how many metres one unit of a monocular map is long at each of N frames, ``(N,)``.
 
     The length is the median ratio of the true to the estimated distance between consecutive frames,
     over the 41 frames around each frame. It is 1 if the camera did not move.

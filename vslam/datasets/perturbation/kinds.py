@@ -29,7 +29,7 @@ t is the time in seconds since the first frame. side is 0 for the left and 1 for
 
 @dataclass(frozen=True)
 class Pair:
-    """The images of one frame, which are passed from one law to the next.
+    """The images of one frame, which are passed from one perturbation to the next.
 
     Attributes:
         index: index of the frame.
@@ -108,14 +108,14 @@ def check_need(law: str, need: Need, scene: Scene) -> None:
 
 @dataclass(frozen=True)
 class SceneLaw:
-    """A perturbation that needs data of the source. It must be bound to a scene before use."""
+    """A perturbation that needs data of the source. `bound_to` must be called before use."""
 
     name: str
     needs: tuple[Need, ...]
     make: Callable[[Scene], PairLaw]
 
     def bound_to(self, scene: Scene) -> PairLaw:
-        """Return the perturbation for one source, whose data is in a scene.
+        """Return the perturbation for the source whose data ``scene`` contains.
 
         Raises:
             InputError: the source does not have the data that the perturbation needs.
@@ -174,7 +174,7 @@ class LawKind:
 
 @dataclass(frozen=True)
 class EachSide:
-    """Applies a perturbation of one image to both images of a frame. Depth is not changed."""
+    """Applies one perturbation to the left and the right image of a frame. Depth is not changed."""
 
     law: Law
 

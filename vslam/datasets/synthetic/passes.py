@@ -29,7 +29,7 @@ _CAR_REACH = np.array([1.1, 2.7])  # half the width and length of the largest ca
 
 
 class Passes:
-    """Computes the scene at each frame of a drive. The class is thread-safe."""
+    """Computes the surfaces and the light at each frame of a drive. The class is thread-safe."""
 
     def __init__(self, route: Route, town: Town, variation: Variation) -> None:
         self._route, self._town, self._variation = route, town, variation
@@ -42,11 +42,11 @@ class Passes:
     def at(self, frame: int) -> Moment:
         number = int(np.searchsorted(self._starts, frame, side="right")) - 1
         light, night = self._light(frame, number)
-        standing = self._standing(frame)
+        standing = self._static_surfaces(frame)
         with self._lock:
             if number not in self._shadows:
                 begin, end = (*self._starts, len(self._route.T_wc))[number : number + 2]
-                occluders = self._standing((begin + end) // 2)
+                occluders = self._static_surfaces((begin + end) // 2)
                 self._shadows[number] = cast_shadows(occluders, self._town.atlas, light.sun)
                 while len(self._shadows) > _SHADOW_MAPS:
                     del self._shadows[next(iter(self._shadows))]
@@ -55,8 +55,7 @@ class Passes:
         surfaces = join([standing, *cars]) if cars else standing
         return Moment(surfaces, shadows, light, night, self._pools if night > 0 else NO_LAMPS)
 
-    def _standing(self, frame: int) -> Surfaces:
-        """Return the surfaces of the ground and of all things that do not move."""
+    def _static_surfaces(self, frame: int) -> Surfaces:
         surfaces, when = self._town.surfaces, self._town.when
         if not when.any():
             return surfaces

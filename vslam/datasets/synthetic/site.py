@@ -19,8 +19,8 @@ from vslam.datasets.synthetic.textures import Rng
 class Palette:
     """The numbers of the town's textures in the atlas.
 
-    ``signs`` contains the front and the back of each sign. ``later_twigs`` are the sparser twigs of
-    trees whose appearance has changed.
+    ``signs`` contains a front and a back texture for each sign. ``later_twigs`` are the sparser
+    twigs of trees whose appearance has changed.
     """
 
     sky: int

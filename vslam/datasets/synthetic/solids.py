@@ -172,7 +172,6 @@ def _trunk(radius: float, height: float, bark: int, thing: int) -> Surfaces:
 
 
 def _branch(rng: Rng, start: Vector, end: Vector, radius: float, bark: int, thing: int) -> Surfaces:
-    """Make a branch of two crossed strips."""
     way = np.asarray(end) - np.asarray(start)
     side = np.cross(way, rng.normal(0, 1, 3))
     side /= np.linalg.norm(side)

@@ -74,7 +74,7 @@ def cache_folder() -> Path:
 
 
 def folder_name(variation: Variation) -> str:
-    """Return the name of the folder for all sequences whose towns have the same variation."""
+    """Return the name of the folder of all sequences whose towns have this variation."""
     name = f"v{VERSION}-seed{variation.seed}"
     name += "-aliased" if variation.aliased else ""
     name += f"-moving{variation.moving}" if variation.moving else ""
@@ -188,7 +188,6 @@ def render_sequence(
 
 
 def _matching_record(folder: Path, wanted: dict[str, Any], camera: Camera) -> dict[str, Any] | None:
-    """Read the manifest of a folder. None if it does not describe the wanted sequence."""
     found = _read_record(folder)
     if found is None or any(found.get(key) != value for key, value in wanted.items()):
         return None
@@ -274,7 +273,7 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
 
 
 def calibration_text(camera: Camera) -> str:
-    """Return the text of KITTI's ``calib.txt``. The colour cameras equal the grey cameras."""
+    """Return KITTI's ``calib.txt``. Colour and grey cameras have the same calibration."""
     lines = []
     for side in range(4):
         shift = -camera.bf if side % 2 else 0.0

@@ -171,7 +171,7 @@ class Plan:
         if (
             (self._taken[window][inside] > 0).any()
             or (self._road[window][inside] < road).any()
-            or self._near_camera(corners)
+            or self._is_near_camera(corners)
         ):
             return False
         self._taken[window][inside] = 1
@@ -179,8 +179,7 @@ class Plan:
             self._tall[window][inside] = 1
         return True
 
-    def _near_camera(self, corners: Float) -> bool:
-        """Return whether a camera position is nearer than `CLEARANCE` to a convex polygon."""
+    def _is_near_camera(self, corners: Float) -> bool:
         middle = corners.mean(axis=0)
         reach = np.linalg.norm(corners - middle, axis=1).max() + CLEARANCE
         polygon = corners.astype(np.float32)[:, None]

@@ -212,7 +212,8 @@ def poster(rng: Rng, size: int = 128) -> Grey:
 def sky(rng: Rng) -> Grey:
     """Make a panorama of clouds over distant trees.
 
-    u corresponds to the heading. v decreases with the elevation.
+    The horizontal axis is the heading. The vertical axis is the tangent of the elevation, from
+    `SKY_RISE` at the top to minus `SKY_FALL`.
     """
     height, width = 512, 2048
     rise = np.linspace(SKY_RISE, -SKY_FALL, height, dtype=np.float32)[:, None]

@@ -73,8 +73,8 @@ def evaluate_trajectory(
     """Compare an estimated trajectory with the ground truth.
 
     Two trajectories of equal length whose timestamps agree within 10 ms are compared frame by
-    frame. Otherwise, each pose is compared with the true pose that is nearest in time, if the two
-    timestamps differ by at most 10 ms.
+    frame. Otherwise, each pose of the shorter trajectory is compared with the pose of the longer
+    trajectory that is nearest in time, if the two timestamps differ by at most 10 ms.
 
     ATE is the RMSE of the positions [Sturm et al., IROS 2012] after alignment by Umeyama's method
     (TPAMI 1991). RPE is computed from one frame to the next. KITTI's drift is computed by

@@ -18,8 +18,8 @@ from vslam.run.outcome import RunOutcome
 def name_of_world(outcome: RunOutcome) -> str:
     """Return the name of the world frame of a run's ground truth.
 
-    All rendered drives along one route have the same name, even if the light or the traffic
-    differs.
+    What follows a ``+`` in the name of the sequence is left out, because rendered drives along one
+    route have the same world frame, even if the light or the traffic differs.
     """
     return f"{outcome.sequence.dataset} {outcome.sequence.name.partition('+')[0]}"
 

@@ -39,15 +39,14 @@ def open_sequence(
             user's cache when they are first used.
         name: name of the sequence. None opens sequence 00 of KITTI or of the rendered towns. For
             EuRoC and TUM, None opens the only sequence in ``root``.
-        start: index of the first frame to read.
-        every: read only every ``every``-th frame.
-        max_frames: largest number of frames to read; None reads all.
+        start, every, max_frames: read the frames ``start``, ``start + every`` and so on, at most
+            ``max_frames`` frames.
         monocular: read only the left camera.
         calib: calibration files (docs/howto/cameras.md), which are used instead of the calibration
             in the data set.
         depth_scale: depth image units per metre, for RGB-D data only.
-        on_render: called after each rendered frame, with the number of frames that are rendered so
-            far and the total number.
+        on_render: called after each rendered frame, with the number of frames rendered so far and
+            the total number.
 
     Raises:
         InputError: the data set is unknown, its plug-in is broken, or the reader rejects the data.

@@ -1,8 +1,4 @@
-"""Associates images and poses by their times.
-
-`associate` pairs images that were taken at nearly the same time. `poses_at` interpolates the ground
-truth at the times of the frames.
-"""
+"""Associates images and poses by their times."""
 
 from __future__ import annotations
 
@@ -21,28 +17,27 @@ _log = logging.getLogger(__name__)
 # (TUM), 200 Hz (EuRoC) or 10 Hz (vehicles). At an acceleration of 2 m/s^2, linear interpolation is
 # off by 6 mm in the middle of this gap.
 _MAX_GAP_S = 0.15
-# Shares of images without a partner: above the first one, a warning is shown; above the second one,
-# `Pairing.is_poor` is true. A recording that begins or ends between the two images of a pair leaves
-# one image without a partner. In TUM's sequences, up to 7 % of the images have no partner.
+# Shares of images without a partner. Above the first share, a warning is shown. Above the second
+# share, `Pairing.is_poor` is true. In TUM's sequences, up to 7 % of the images have no partner.
 _FEW, _MANY = 0.01, 0.1
 
 
 def associate(
     first: NDArray[np.float64], second: NDArray[np.float64], max_difference: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pair the times of two lists that are less than ``max_difference`` apart.
+    """Pair the times of two lists. The two times of a pair differ by less than ``max_difference``.
 
-    The closest pairs are formed first, and each time is used at most once.
+    The closest pairs are formed first. Each time is used at most once, so that some times may have
+    no partner.
 
     Args:
-        first: ``(N,)`` times, increasing.
-        second: ``(M,)`` times, increasing, in the same unit.
-        max_difference: upper limit of the difference between the two times of a pair, in the same
-            unit.
+        first: ``(N,)`` increasing times in any unit.
+        second: ``(M,)`` increasing times in the same unit.
+        max_difference: upper limit in the same unit.
 
     Returns:
-        Two arrays that describe the P pairs: ``(P,)`` increasing indices into ``first``, and
-        ``(P,)`` indices into ``second``.
+        ``(P,)`` increasing indices into ``first``, and ``(P,)`` indices of their partners in
+        ``second``.
     """
     low = np.searchsorted(second, first - max_difference, side="right")
     high = np.searchsorted(second, first + max_difference, side="left")
@@ -62,18 +57,17 @@ def associate(
 class Pairing:
     """Counts how many images a reader pairs by time, and how many images it leaves out.
 
-    The reader of a stream counts the images while it reads them. Readers do not log the warnings of
-    this class. Instead, the warnings are shown in the summary and in the report of a run, and by
-    ``vslam doctor`` and ``vslam calibrate``.
+    A stream is counted while it is read. The warnings are shown in the summary and in the report of
+    a run, and by ``vslam doctor`` and ``vslam calibrate``.
 
     Attributes:
-        source: name of the file or folder, for messages.
+        source: file or folder of the images, for messages.
         partner: what the second image of a pair is called in messages, such as ``depth image``.
         within_s: largest difference in seconds between the two times of a pair.
         fix: what the user can do if images are left out.
         n_pairs: number of pairs.
         left_out: times in seconds of the images without a partner.
-        seconds: times in seconds of all images that can be partners.
+        seconds: times in seconds of all possible partners, whether they are paired or not.
     """
 
     source: Path
@@ -91,7 +85,7 @@ class Pairing:
         said = f"{n} of {n + self.n_pairs} images are left out"
         if not n:
             return said
-        apart = self._gaps()
+        apart = self._seconds_to_nearest_partner()
         far = apart[apart > self.within_s]
         alone = f"because no {self.partner} is within {1e3 * self.within_s:g} ms of them"
         if len(far) and np.isfinite(far).all():
@@ -109,10 +103,7 @@ class Pairing:
         return len(self.left_out) > _MANY * (len(self.left_out) + self.n_pairs)
 
     def warnings(self) -> list[str]:
-        """One warning if more than a hundredth of the images are left out, otherwise none.
-
-        The warning states how many images are left out, the reason, and what the user can do.
-        """
+        """Return a warning if more than a hundredth of the images are left out."""
         if len(self.left_out) <= _FEW * (len(self.left_out) + self.n_pairs):
             return []
         return [f"{self.source}: {self.measured}; {self.fix}."]
@@ -132,17 +123,13 @@ class Pairing:
         self.seconds = seconds.tolist()
 
     def restart(self) -> None:
-        """Reset all counts. The reader of a stream calls this when it starts from the beginning."""
+        """Reset all counts, before a stream is read again from its beginning."""
         self.n_pairs = 0
         self.left_out.clear()
         self.seconds.clear()
 
-    def _gaps(self) -> NDArray[np.float64]:
-        """Return the time between each left-out image and the nearest possible partner, in seconds.
-
-        The nearest possible partner may be paired with a different image. The time difference is
-        infinite if there are no possible partners.
-        """
+    def _seconds_to_nearest_partner(self) -> NDArray[np.float64]:
+        """The time is infinite if there are no possible partners."""
         times = np.array(self.left_out)
         if not self.seconds:
             return np.full(len(times), np.inf)
@@ -157,7 +144,8 @@ def poses_at(
 ) -> NDArray[np.float64] | None:
     """Interpolate the poses of the ground truth at given times.
 
-    Positions are interpolated linearly. Rotations are interpolated by slerp.
+    Positions are interpolated linearly, and rotations by slerp. If no time has a pose, a warning is
+    logged.
 
     Args:
         source: name of the ground-truth file, for the log.
@@ -165,8 +153,7 @@ def poses_at(
 
     Returns:
         ``(N, 4, 4)`` float64 ``T_wc``. A pose is NaN if its time is before the first measurement,
-        after the last one, or in a gap longer than 0.15 s. If no time has a pose, the function logs
-        a warning and returns None.
+        after the last one, or in a gap longer than 0.15 s. None if no time has a pose.
     """
     from scipy.spatial.transform import Rotation, Slerp
 

@@ -137,7 +137,7 @@ def open_bag(
             topics=chosen,
             sizes=sizes[:1] if depth else sizes,
             play=partial(_play, path, chosen, sizes, depth, depth_scale, pairing),
-            n_expected=_count(bag, chosen),
+            n_expected=_estimated_frames(bag, chosen),
             depth=depth,
             pairing=pairing if len(chosen) == 2 else None,
         )
@@ -185,8 +185,8 @@ def find_calibration(source: BagSource) -> Calibration | None:
     """Read the calibration from the ``camera_info`` topics that belong to the image topics.
 
     Returns:
-        The calibration. The result is None if a ``camera_info`` topic is missing, or if a focal
-        length is 0. A focal length of 0 means that the camera is not calibrated.
+        The calibration. None if a ``camera_info`` topic is missing, or if the focal length in it is
+        0, which means that the camera is not calibrated.
 
     Raises:
         InputError: a ``camera_info`` message cannot be read, or is not a valid calibration.
@@ -271,28 +271,17 @@ def _opened(path: Path) -> Iterator[Bag]:
 
 
 def _check_metadata(file: Path) -> None:
-    """Reject a metadata file that is so large that rosbags would need too much time and memory.
-
-    rosbags needs 30 us and 300 bytes of memory for each byte of the file.
-
-    Raises:
-        ValueError: the file is too large.
-    """
+    """Reject a large file, because rosbags needs 30 us and 300 bytes of memory for each byte."""
     if file.is_file() and file.stat().st_size > _MOST_METADATA:
         raise ValueError(f"{file.name} is larger than {_MOST_METADATA / 1e6:.0f} MB")
 
 
 def _messages(bag: Bag, path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, Message]]:
-    """Yield each message of the given topics together with its topic, in the recorded order.
-
-    Raises:
-        BrokenSourceError: the bag is damaged. The messages before the damage are yielded first.
-    """
     connections = [c for c in bag.connections if c.topic in topics]
     try:
         for connection, _, data in bag.messages(connections=connections):
             yield connection.topic, bag.deserialize(data, connection.msgtype)
-    except Exception as error:  # many kinds, as in _opened
+    except Exception as error:  # rosbags raises many kinds, as in _opened
         raise BrokenSourceError(
             f"{path}: the bag is damaged or cut off ({_reason(error)}); copy it again."
         ) from error
@@ -309,10 +298,9 @@ def _tolerance(depth: bool) -> int:
 def _synchronised(
     messages: Iterator[tuple[str, Message]], topics: tuple[str, ...], pairing: Pairing
 ) -> Iterator[tuple[Message, ...]]:
-    """Pair the messages of two topics by their time stamps, and yield one pair after the other.
+    """Yield pairs of messages of two topics that have nearly the same time stamp.
 
-    ``pairing`` counts the messages with and without a partner. A message is paired only when it is
-    certain that no later message of the other topic is nearer in time.
+    A message is paired only when no later message of the other topic can be nearer in time.
     """
     pairing.restart()
     if len(topics) == 1:
@@ -387,8 +375,7 @@ def _choose_topics(
     return topics[:n], depth
 
 
-def _count(bag: Bag, topics: tuple[str, ...]) -> int | None:
-    """Return the approximate number of frames; None if the bag does not state it."""
+def _estimated_frames(bag: Bag, topics: tuple[str, ...]) -> int | None:
     try:
         n = min(bag.topics[topic].msgcount for topic in topics)
     except TypeError:

@@ -34,10 +34,7 @@ class _Decompressor(Protocol):
 
 
 def limit_bags() -> None:
-    """Make rosbags reject chunks, messages and files that exceed the limits.
-
-    Only the first call of this function has an effect.
-    """
+    """Make rosbags reject chunks, messages and files that are too large to decompress."""
     import lz4.frame
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import reader, storage_mcap
@@ -70,7 +67,7 @@ def limit_bags() -> None:
 
 
 def unpack(make: Callable[[], _Decompressor], data: bytes, most: int) -> bytes:
-    """Decompress data that consists of one or more compressed frames, to at most ``most`` bytes.
+    """Decompress ``data``, which consists of one or more compressed frames.
 
     Raises:
         ValueError: the result exceeds ``most`` bytes, or the data is truncated.
@@ -94,12 +91,12 @@ def _limited(make: Callable[[], _Decompressor]) -> Callable[[bytes], bytes]:
 
 
 def _limited_by_size(make: Callable[[], _Decompressor]) -> Callable[[bytes, int], bytes]:
-    """Decompress a chunk. The result must not exceed the size in the bag, nor `MOST_BYTES`."""
+    """``size`` is the decompressed size that the bag states."""
     return lambda data, size: unpack(make, data, min(size, MOST_BYTES))
 
 
 class _LimitedFile:
-    """A compressed file that rosbags decompresses into a temporary folder."""
+    """A compressed bag that rosbags unpacks into a temporary folder while the disk has space."""
 
     def __init__(self, file: Any) -> None:
         self._file = file

@@ -68,24 +68,22 @@ def grey_of(message: Message) -> Image:
     Only the upper eight bits of 16-bit values are kept.
 
     Raises:
-        ValueError: the image cannot be decoded. The message of the error states the reason.
+        ValueError: the image cannot be decoded.
     """
     return _decoded(message, "GRAY")
 
 
 def colour_of(message: Message) -> NDArray[np.uint8]:
-    """Decode an image to ``(H, W, 3)`` uint8 red, green, blue.
-
-    A grey image is decoded to ``(H, W)`` uint8 grey values.
+    """Decode an image to ``(H, W, 3)`` uint8 red, green, blue. A grey image becomes ``(H, W)``.
 
     Raises:
-        ValueError: as `grey_of`.
+        ValueError: the image cannot be decoded.
     """
     return _decoded(message, "RGB")
 
 
 def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
-    """Decode an image to grey values or RGB. If ``RGB`` is requested, a grey image stays grey."""
+    """Decode an image to ``GRAY`` or ``RGB``. A grey image stays grey."""
     import cv2
 
     from vslam.datasets.png import decode_with_opencv
@@ -136,7 +134,7 @@ def depth_of(message: Message, scale: float | None) -> DepthImage:
             images and 1 for 32-bit images.
 
     Raises:
-        ValueError: as `grey_of`.
+        ValueError: the image cannot be decoded.
     """
     if not hasattr(message, "encoding"):
         return _compressed_depth(message, scale)
@@ -149,10 +147,9 @@ def depth_of(message: Message, scale: float | None) -> DepthImage:
 
 
 def _compressed_depth(message: Message, scale: float | None) -> DepthImage:
-    """Decode an image of ``compressed_depth_image_transport``.
+    """Decode a message of ``compressed_depth_image_transport``, which contains a PNG file.
 
-    The message contains a PNG file. For a 16-bit depth image, the file holds the depth values. For
-    a 32-bit depth image, the file holds the quantised inverse depth. The header of the message
+    For 32-bit depth, the PNG file holds the quantised inverse depth. The header of the message
     (``ConfigHeader``) contains the two parameters of this quantisation.
     """
     import cv2
@@ -199,8 +196,7 @@ def _pixels(message: Message, channels: int, bits: int, kind: str = "u") -> NDAr
 def camera_info(message: Message, source: str, rectified: bool) -> Document | None:
     """Convert a ``CameraInfo`` to the input of `vslam.calibration.formats.read_ros`.
 
-    Returns None if the camera is not calibrated. In this case, ROS defines that all entries of the
-    camera matrix K are zero.
+    Returns None if the camera is not calibrated, which ROS defines as a camera matrix K of zeros.
 
     Args:
         source: bag and topic, for error messages.

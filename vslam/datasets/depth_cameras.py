@@ -60,7 +60,7 @@ class DepthCamera:
 
 
 def frames_of(device: DepthCamera) -> RawSource:
-    """Make a source from the frames that a device delivers. The frames can be read only once."""
+    """Make a source of the frames that a device delivers. The frames can be read only once."""
     calibration = device.calibration
     models = [model for model in (calibration.left, calibration.right) if model is not None]
     return RawSource(

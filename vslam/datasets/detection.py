@@ -19,8 +19,7 @@ _ARCHIVES = {".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".7z", ".rar"
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 
 
-def _within(folder: Path) -> tuple[Path, ...]:
-    """Return a folder and its subfolders. Each of them may be the folder of a sequence."""
+def _with_subfolders(folder: Path) -> tuple[Path, ...]:
     return (folder, *(path for path in folder.glob("*") if path.is_dir()))
 
 
@@ -35,12 +34,12 @@ _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
     (
         "euroc",
         "a folder 'mav0'",
-        lambda path: any(is_euroc(folder) for folder in _within(path)),
+        lambda path: any(is_euroc(folder) for folder in _with_subfolders(path)),
     ),
     (
         "tum",
         "a file rgb.txt",
-        lambda path: any(is_tum(folder) for folder in _within(path)),
+        lambda path: any(is_tum(folder) for folder in _with_subfolders(path)),
     ),
     (
         "bag",
@@ -93,10 +92,7 @@ def _kind_of(path: Path) -> str | None:
 
 
 def _nearest(path: Path) -> str:
-    """Return a hint for an error message about a folder that is not a data set.
-
-    The text is empty unless the folder is the parent or a subfolder of a data set.
-    """
+    """Name a data set in the parent folder or in a subfolder, for an error message."""
     if path.resolve().name == "sequences":
         return f", but {path.resolve().parent} looks like kitti (name that folder)"
     for inside in sorted(path.glob("*")):

@@ -44,19 +44,18 @@ def open_euroc(
     monocular: bool = False,
     calib: Several[Path | str] = (),
 ) -> Source:
-    """Open a sequence. Its images are rectified when they are read.
+    """Open a sequence of EuRoC. Its images are rectified when they are read.
 
     A frame consists of a left image and the right image that is nearest in time. Left images
-    without a right image within 5 ms are skipped. `vslam.datasets.association.poses_at`
-    interpolates the ground truth at the times of the frames.
+    without a right image within 5 ms are skipped. The ground truth is interpolated at the times of
+    the frames.
 
     Args:
         root: folder of the sequence, or a folder that contains several sequences.
         name: name of the sequence in ``root``. None opens ``root`` itself or, if it is not a
             sequence, the only sequence in it.
-        start: index of the first pair to read.
-        every: read only every ``every``-th pair.
-        max_frames: largest number of pairs to read; None reads all.
+        start, every, max_frames: read the frames ``start``, ``start + every`` and so on, at most
+            ``max_frames`` frames.
         monocular: read only the left camera.
         calib: calibration files, which are used instead of the cameras' ``sensor.yaml``.
 
@@ -83,7 +82,7 @@ def open_raw_euroc(
     max_frames: int | None = None,
     monocular: bool = False,
 ) -> RawSource:
-    """Open the unrectified images of a sequence, without its calibration and ground truth.
+    """Open the unrectified images of a sequence of EuRoC, without its calibration and ground truth.
 
     The arguments have the same meaning as for `open_euroc`.
     """
@@ -93,7 +92,7 @@ def open_raw_euroc(
 
 
 def is_euroc(root: Path) -> bool:
-    """Return whether a folder contains the left camera of a sequence in this layout."""
+    """Return whether a folder contains the left camera of a sequence in EuRoC's layout."""
     return any((base / "cam0" / "data.csv").is_file() for base in (root / "mav0", root))
 
 
@@ -153,14 +152,7 @@ def _read_list(camera: Path) -> tuple[list[int], list[str]]:
 
 
 def _pair(cameras: list[Path], times: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Pair the images of the cameras by time.
-
-    Args:
-        times: for each camera, the ``(M,)`` times of its images in nanoseconds.
-
-    Returns:
-        ``(N, cameras)`` int64 indices of the images of each frame.
-    """
+    """Return the ``(N, cameras)`` indices of the images of each frame. ``times`` are in ns."""
     if len(times) == 1:
         return np.arange(len(times[0]))[:, None]
     left, right = ((side - times[0][0]).astype(np.float64) for side in times)  # exact nanoseconds
@@ -207,10 +199,7 @@ def _read_ground_truth(base: Path, stamps: NDArray[np.int64]) -> NDArray[np.floa
 
 
 def _read_states(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Read the ground truth: ``(N,)`` times in ns, and ``(N, 7)`` positions (m) and quaternions.
-
-    The scalar part w of a quaternion comes first.
-    """
+    """Read ``(N,)`` times in ns, and ``(N, 7)`` positions (m) and quaternions (w, x, y, z)."""
     times, rows = [], []
     for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
         if not line.strip() or line.startswith("#"):

@@ -57,7 +57,7 @@ class Fixes:
         return len(self.times)
 
     def between(self, first: float, last: float) -> Fixes:
-        """Return the fixes between two times in seconds. Both times are included."""
+        """Return the fixes from time ``first`` to time ``last``, inclusive, in seconds."""
         return self.select((self.times >= first) & (self.times <= last))
 
     def select(self, chosen: NDArray[np.bool_]) -> Fixes:
@@ -120,7 +120,7 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
 def require_overlap(fixes: Fixes, source: Source, path: Path) -> None:
     """Check that at least one fix was recorded while the images were taken.
 
-    The time of the last image of a stream is unknown. It is treated as infinite.
+    The end of a stream is unknown. It is treated as infinitely late.
 
     Raises:
         InputError: the source is a live camera, or no fix was recorded while its images were taken.
@@ -160,7 +160,12 @@ def to_enu(geodetic: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray
 def to_geodetic(enu: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray[np.float64]:
     """Convert coordinates in the east-north-up frame of a datum to WGS84 coordinates.
 
-    This function is the inverse of `to_enu`.
+    Args:
+        enu: ``(N, 3)`` metres east, north and up.
+        datum: ``(3,)`` latitude (degrees), longitude (degrees) and altitude (m) of the origin.
+
+    Returns:
+        ``(N, 3)`` latitude and longitude (degrees) and altitude (m).
     """
     from pymap3d import enu2geodetic
 
@@ -168,10 +173,7 @@ def to_geodetic(enu: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray
 
 
 def _read_csv(path: Path) -> NDArray[np.float64]:
-    """Read M fixes from a CSV file.
-
-    Returns ``(M, 7)`` float64 in the format of `vslam.datasets.bag.read_fixes_of_bag`.
-    """
+    """Return ``(M, 7)`` fixes in the format of `vslam.datasets.bag.read_fixes_of_bag`."""
     try:
         lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -211,10 +213,9 @@ def _read_csv(path: Path) -> NDArray[np.float64]:
 
 
 def _read_oxts(folder: Path) -> NDArray[np.float64]:
-    """Read M fixes from the folder ``oxts`` of KITTI raw.
+    """Return ``(M, 7)`` fixes in the format of `vslam.datasets.bag.read_fixes_of_bag`.
 
-    Returns ``(M, 7)`` float64 in the format of `vslam.datasets.bag.read_fixes_of_bag`. The first
-    fix has the time 0, as in KITTI odometry.
+    The first fix has the time 0, as in KITTI odometry.
     """
     files = sorted((folder / "data").glob("*.txt"))
     if not files:
@@ -238,12 +239,11 @@ def _read_oxts(folder: Path) -> NDArray[np.float64]:
 
 
 def _antenna_of_kitti(folder: Path) -> Sequence[float] | None:
-    """Read the position of the inertial unit in the frame of the left grey camera of KITTI raw.
+    """Read the position of KITTI's inertial unit in the frame of the left grey camera.
 
-    The fixes of KITTI raw are the positions of the inertial unit. Its position relative to the
-    camera is read from the calibration in the drive's date folder. Returns None if there is no
-    calibration. The rectifying rotation of the camera is ignored, because its angle is less than a
-    degree.
+    The fixes of KITTI raw are the positions of this unit. ``folder`` is the drive's date folder,
+    which contains the calibration. The rectifying rotation of the camera is ignored, because its
+    angle is less than a degree.
     """
     paths = [folder / name for name in ("calib_imu_to_velo.txt", "calib_velo_to_cam.txt")]
     if not all(path.is_file() for path in paths):

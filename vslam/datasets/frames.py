@@ -37,27 +37,26 @@ _FIRST_FRAMES = 120  # a few seconds; a stereo pair of 752x480 pixels takes 0.7 
 class TimedFrame:
     """A frame whose images are decoded on demand.
 
+    The functions ``read``, ``sides``, ``colour`` and ``mask`` raise UnreadableImageError if a file
+    is damaged or if an image has the wrong size. ``read`` can be called in any thread.
+
     Attributes:
         timestamp: seconds.
-        read: function that decodes and returns the left and the second image. It can be called in
-            any thread. The left image is ``(H, W)`` uint8. For stereo, the second image is the
-            right image, ``(H, W)`` uint8. For RGB-D, it is the depth of the left image's pixels,
-            ``(H, W)`` float32 metres, which is 0 where the depth is unknown. For a monocular
-            source, it is None. The argument is a map function (`vslam.camera.ImageMap`), which may
-            decode both images in parallel. The function raises UnreadableImageError if a file is
-            damaged or if its image size differs from the calibration.
-        sides: two functions. The first one decodes only the left image, and the second one decodes
-            only the right image. Both functions raise the same errors as ``read``. ``sides`` is
-            None if both images can only be decoded together, or if there is no right image.
-        file: file of the left image. None if the image has no file of its own, or if the image has
-            to be rectified.
+        read: function that decodes the left and the second image. Its argument is a map function
+            (`vslam.camera.ImageMap`), which may decode both images in parallel. The left image is
+            ``(H, W)`` uint8. For stereo, the second image is the right image, ``(H, W)`` uint8. For
+            RGB-D, it is the depth of the left image's pixels, ``(H, W)`` float32 metres, 0 where
+            the depth is unknown. For a monocular source, it is None.
+        sides: a function that decodes only the left image, and a function that decodes only the
+            right image. None if both images can only be decoded together, or if there is no right
+            image.
+        file: file of the left image. None if the image has no file of its own, or if it has to be
+            rectified.
         colour: function that decodes the left image in colour, ``(H, W, 3)`` uint8 red, green,
-            blue. A grey image is ``(H, W)``. The function raises the same errors as ``read``.
-            ``colour`` is None if the source has no colours.
+            blue. A grey image is ``(H, W)``. None if the source has no colours.
         name: file name of the left image; None if the image has no file of its own.
         mask: function that reads the mask of the left image, ``(H, W)`` uint8. Pixels at which the
-            mask is 0 are not used. The function raises UnreadableImageError if the mask cannot be
-            read. ``mask`` is None if all pixels are used.
+            mask is 0 are not used. None if all pixels are used.
     """
 
     timestamp: float
@@ -100,8 +99,8 @@ class _Frames:
     def frames(self) -> Iterator[TimedFrame]:
         """Yield all frames in order.
 
-        Each call starts from the first frame, unless frames arrive in real time from a camera. Only
-        the images of the current frame are held in memory.
+        Each call starts from the first frame, except for a live camera. Only the images of the
+        current frame are held in memory.
 
         Raises:
             BrokenSourceError: a file is truncated or a device was unplugged. All frames before the
@@ -145,8 +144,8 @@ class Source(_Frames):
         dataset: kind of source, for example ``kitti`` or ``video``.
         name: name of the sequence, file or device.
         camera: calibration. ``camera.sensor`` tells which images each frame has.
-        stored: N frames that can be read in any order; empty for a stream. The function
-            `stored_frames` makes them.
+        stored: N frames that can be read in any order, for example from `stored_frames`; empty for
+            a stream.
         play: function that yields the frames of a stream; None if the frames are stored.
         n_expected: number of frames. For a stream, it is approximate. None if it is unknown.
         live: whether frames arrive in real time, as from a camera. Such frames are lost if they are
@@ -154,8 +153,8 @@ class Source(_Frames):
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose. None if there
             is no ground truth.
         pairing: how many images were paired with a second image by time, and how many images were
-            left out because they have no partner. For a stream, only the images that have been read
-            so far are counted. None if images are not paired by time.
+            left out. For a stream, only the images that have been read so far are counted. None if
+            images are not paired by time.
         rectify_mask: function that rectifies an ``(H, W)`` uint8 mask of the original left images.
             None if vslam does not rectify the images.
 
@@ -170,9 +169,7 @@ class Source(_Frames):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RawSource(_Frames):
-    """A source of unrectified images.
-
-    Attributes that are not listed here have the same meaning as in `Source`.
+    """A source of unrectified images. Its other attributes have the same meaning as in `Source`.
 
     Attributes:
         sizes: width and height of each camera's images. It has only one entry if the second image
@@ -217,9 +214,8 @@ def selected(
     """Select frames of a source.
 
     Args:
-        start: index of the first frame to read.
-        every: read only every ``every``-th frame.
-        max_frames: largest number of frames to read; None reads all.
+        start, every, max_frames: read the frames ``start``, ``start + every`` and so on, at most
+            ``max_frames`` frames.
 
     Raises:
         InputError: an option is out of range, or ``start`` is beyond the last frame.
@@ -253,10 +249,7 @@ def _play_selected(source: Source | RawSource, chosen: slice) -> Iterator[TimedF
 
 
 def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]:
-    """Yield the frames, but skip each frame that is not later than the previous frame.
-
-    A warning is logged for each skipped frame.
-    """
+    """Yield the frames, but skip and log each frame that is not later than the previous frame."""
     last = None
     for frame in frames:
         if last is not None and frame.timestamp <= last:
@@ -272,10 +265,9 @@ def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]
 
 
 def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
-    """Yield the frames of a source that have the given indices, which must increase.
+    """Yield the frames of a source with the given indices. The indices must increase.
 
-    A stream is read only up to the last of these frames. If the source ends earlier, fewer frames
-    are yielded.
+    If the source ends earlier, fewer frames are yielded.
     """
     if source.seekable:
         yield from (source.stored[k] for k in indices if k < len(source))
@@ -288,8 +280,8 @@ def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
 def first_frames(source: Source) -> Source:
     """Load the first frames of a stream into memory, so that they can be read in any order.
 
-    A source that can seek is returned unchanged. If a frame cannot be decoded, this function does
-    not raise an error. Instead, an UnreadableImageError is raised whenever this frame is read.
+    A source whose frames are stored is returned unchanged. If a frame cannot be decoded, the error
+    is raised only when this frame is read.
 
     Raises:
         InputError: the stream has no frames.

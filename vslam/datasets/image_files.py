@@ -46,8 +46,7 @@ def checked_files(
         sides: one or two lists of N files. The first list contains the left images. The second list
             contains the right images or the depth images.
         depth_scale: depth image units per metre; None if there are no depth images.
-        pairing: numbers of paired images and of left-out images; None if the images were not paired
-            by time.
+        pairing: how many images were paired by time; None if the images were not paired by time.
 
     Raises:
         UnreadableImageError: a file is empty, the first frame cannot be decoded, or the first depth
@@ -60,7 +59,8 @@ def checked_files(
 
     def frame(timestamp: float, *files: Path) -> TimedFrame:
         grey = [
-            partial(_read_grey_of, size, file) for size, file in zip(sizes, files, strict=False)
+            partial(_read_grey_of_size, size, file)
+            for size, file in zip(sizes, files, strict=False)
         ]
         decoders: list[Callable[[], Image | DepthImage]] = [*grey]
         if depth_scale is not None:
@@ -99,7 +99,7 @@ def image_size(path: Path) -> Size:
 
 
 def list_images(folder: Path) -> dict[str, Path]:
-    """List the image files of a folder, sorted by name. The result maps file stems to files.
+    """List the image files of a folder, sorted by name, as a dictionary from stems to files.
 
     The result is empty if there is no such folder.
 
@@ -165,14 +165,15 @@ def read_image_list(
 
 
 def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:
-    """Find the folder of a sequence. It is either ``root`` or a subfolder of ``root``.
-
-    Returns None if there is no sequence.
+    """Find the folder of a sequence, which is either ``root`` or a subfolder of ``root``.
 
     Args:
         name: name of the sequence's folder. None finds ``root`` itself or, if it is not a sequence,
             the only sequence in it.
         is_sequence: function that tells whether a folder contains a sequence.
+
+    Returns:
+        The folder, or None if there is no sequence.
 
     Raises:
         InputError: no sequence has this name, or there are several sequences and ``name`` is None.
@@ -199,14 +200,13 @@ def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bo
 def select_frames(
     source: Path, n: int, start: int, every: int, max_frames: int | None
 ) -> NDArray[np.int64]:
-    """Return the indices of the frames that ``start``, ``every`` and ``max_frames`` select.
+    """Return the indices of the selected frames.
 
     Args:
         source: folder of the frames, for error messages.
         n: number of frames, at least 1.
-        start: index of the first frame to read.
-        every: read only every ``every``-th frame.
-        max_frames: largest number of frames to read; None reads all.
+        start, every, max_frames: select the frames ``start``, ``start + every`` and so on, at most
+            ``max_frames`` frames.
 
     Raises:
         InputError: an option is out of range, or ``start`` is beyond the last frame.
@@ -219,10 +219,10 @@ def select_frames(
 
 
 def check_not_empty(path: Path) -> None:
-    """Check that a file has contents.
+    """Check that a file exists and is not empty.
 
     Raises:
-        UnreadableImageError: the file is missing or empty, or it is a link to a missing file.
+        UnreadableImageError: the file is missing or empty.
     """
     try:
         empty = path.stat().st_size == 0
@@ -280,8 +280,7 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _read_grey_of(size: Size, path: Path) -> Image:
-    """Decode an image using `read_grey`, and check that it has the given size."""
+def _read_grey_of_size(size: Size, path: Path) -> Image:
     image = read_grey(path)
     if image.shape != size[::-1]:
         raise UnreadableImageError(
@@ -298,10 +297,9 @@ def size_text(shape: tuple[int, ...]) -> str:
 
 
 def with_depth(camera: Camera, calibration: Calibration) -> Camera:
-    """Return a camera for RGB-D images, which has a virtual baseline.
+    """Return a camera for RGB-D images, with the virtual baseline of the calibration.
 
-    The virtual baseline is taken from the calibration. If the calibration has no virtual baseline,
-    the baseline of a Kinect is used.
+    If the calibration has no virtual baseline, the baseline of a Kinect is used.
     """
     baseline = calibration.virtual_baseline or _VIRTUAL_BASELINE
     return replace(camera, baseline=baseline, depth=True)

@@ -60,7 +60,7 @@ _UNITS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3), (1e9, 1))
 
 
 def has_images(folder: Path) -> bool:
-    """Return whether a folder contains images, or contains a pair of folders with images."""
+    """Return whether a folder contains images, or a pair of folders with images."""
     inside = (folder / left for left, _ in PAIRS + DEPTH_PAIRS)
     return any(list_images(place) for place in (folder, *inside))
 
@@ -76,8 +76,7 @@ class ImageFolders:
             left camera. The second list has the images of the right camera, or the depth images.
         depth: whether the second list has depth images.
         size: width and height of the first image.
-        pairing: numbers of paired images and of left-out images; None if the images were not paired
-            by time.
+        pairing: how many images were paired by time; None if the images were not paired by time.
     """
 
     name: str
@@ -126,9 +125,8 @@ def open_images(
         right: folder of the right images. If it is given, ``folder`` contains the left images.
         depth: folder of the depth images. If it is given, ``folder`` contains the images.
         fps: frames per second. If it is given, the time stamps of the images are not used.
-        start: index of the first frame to read.
-        every: read only every ``every``-th frame.
-        max_frames: largest number of frames to read; None reads all.
+        start, every, max_frames: read the frames ``start``, ``start + every`` and so on, at most
+            ``max_frames`` frames.
         sensor: ``stereo``, ``rgbd`` or ``mono``. With ``mono``, only the left images are read. None
             reads all images that are found.
 
@@ -142,7 +140,7 @@ def open_images(
     depth = None if depth is None else Path(depth)
     places, is_depth = _find_sides(folder, right, depth, sensor)
     listed = [_sorted_images(place) for place in places]
-    files, pairing = _matched(listed, places, by_time=is_depth)
+    files, pairing = _paired(listed, places, by_time=is_depth)
     n = len(files[0])
     times = np.arange(n) / fps if fps is not None else _find_times(places[0], files[0])
     if (bad := np.flatnonzero(np.diff(times) <= 0)).size:
@@ -159,7 +157,7 @@ def open_images(
 def _find_sides(
     folder: Path, right: Path | None, depth: Path | None, sensor: str | None
 ) -> tuple[list[Path], bool]:
-    """Find the folders of the first and second images, and whether the second images are depth."""
+    """Return the folders of the images, and whether the second folder contains depth images."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give a folder of images with --data.")
     if right is not None and depth is not None:
@@ -187,11 +185,7 @@ def _find_sides(
 
 
 def _near_miss(folder: Path) -> str:
-    """Return a hint for an error message about a folder without images.
-
-    The text is empty unless only one folder of a pair exists, or the user named only one folder of
-    a pair.
-    """
+    """Describe an incomplete or misnamed pair of folders for an error message."""
     above = folder.resolve().parent
     for names in PAIRS + DEPTH_PAIRS:
         if all(list_images(above / name) for name in names) and folder.resolve().name in names:
@@ -206,8 +200,8 @@ def _near_miss(folder: Path) -> str:
 def _sorted_images(folder: Path) -> dict[str, Path]:
     """List the images of a folder by stem, in the order in which they were taken.
 
-    If all names are times, the images are sorted by time. Otherwise, they are sorted by the numbers
-    in their names, so that 2 comes before 10.
+    If not all names are times, the images are sorted by the numbers in their names, so that 2 comes
+    before 10.
     """
     images = list_images(folder)
     if not images:
@@ -222,7 +216,7 @@ def _sorted_images(folder: Path) -> dict[str, Path]:
     return {stem: images[stem] for stem in ordered or sorted(images, key=by_number)}
 
 
-def _matched(
+def _paired(
     sides: list[dict[str, Path]], folders: list[Path], *, by_time: bool
 ) -> tuple[list[list[Path]], Pairing | None]:
     """Pair the files of two folders. Return the files of each folder in the order of the pairs."""
@@ -230,7 +224,7 @@ def _matched(
     for other in rest:
         if first.keys() == other.keys():
             return [[side[stem] for stem in first] for side in sides], None
-        if by_time and (pairs := _near_in_time(first, other)) is not None:
+        if by_time and (pairs := _paired_by_time(first, other)) is not None:
             return pairs
         if len(other) != len(first) or first.keys() & other.keys():
             raise InputError(
@@ -241,13 +235,10 @@ def _matched(
     return [list(side.values()) for side in sides], None
 
 
-def _near_in_time(
+def _paired_by_time(
     first: dict[str, Path], second: dict[str, Path]
 ) -> tuple[list[list[Path]], Pairing] | None:
-    """Pair the files of two folders by the times in their names.
-
-    Returns None if the names are not times.
-    """
+    """Pair the files of two folders by the times in their names. None if a name is not a time."""
     files = [list(side.values()) for side in (first, second)]
     times = [[_time_of_name(path) for path in side] for side in files]
     if any(time is None for side in times for time in side):
@@ -309,10 +300,7 @@ def _time_of_name(path: Path) -> float | None:
 
 
 def _time_of_exif(path: Path) -> float | None:
-    """Read the time of an image from its EXIF data; None if they contain no time.
-
-    The time is in seconds since 1970 by the camera's clock.
-    """
+    """Read the time in the EXIF data, as seconds since 1970 by the camera's clock."""
     from PIL import Image as PillowImage
 
     try:

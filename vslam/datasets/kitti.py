@@ -38,7 +38,7 @@ def open_kitti(
     monocular: bool = False,
     calib: Several[Path | str] = (),
 ) -> Source:
-    """Open a sequence of KITTI odometry. Images may be missing in frames that are not selected.
+    """Open a sequence of KITTI odometry. Images of frames that are not selected may be missing.
 
     The k-th row of ``times.txt`` and of the poses belongs to the k-th image. If such a file has
     more rows than there are images, the number in the file name of an image is the number of its
@@ -48,9 +48,8 @@ def open_kitti(
         root: folder that contains ``sequences`` and, optionally, ``poses``. As in KITTI's archives,
             it may contain ``dataset/sequences`` instead.
         name: name of the sequence, for example ``00``.
-        start: index of the first frame to read, among the existing frames.
-        every: read only every ``every``-th frame.
-        max_frames: largest number of frames to read; None reads all.
+        start, every, max_frames: of the existing frames, read ``start``, ``start + every`` and so
+            on, at most ``max_frames`` frames.
         monocular: read only the left camera. The right camera's images need not exist.
         calib: calibration files, which are used instead of ``calib.txt``. If they are given, the
             images are rectified when they are read.
@@ -70,7 +69,7 @@ def open_kitti(
             f"download the grayscale images (22 GB) from {_HOME}."
         )
     chosen = select_frames(folder, len(stems), start, every, max_frames)
-    sides = _check_frames(folder, listed, [stems[k] for k in chosen])
+    sides = _files_of_frames(folder, listed, [stems[k] for k in chosen])
     times = _read_times(folder / "times.txt")
     frames = _row_numbers(folder / "times.txt", stems, len(times))[chosen]
     truth = _read_ground_truth(base / "poses" / f"{name}.txt", stems, len(times), chosen)
@@ -96,7 +95,7 @@ def open_kitti(
 
 
 def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
-    """List all sequences with their names and their numbers of left and right images.
+    """List the name of each sequence, and its numbers of left and right images.
 
     Raises:
         InputError: ``root`` holds no KITTI data.
@@ -111,8 +110,6 @@ def read_calibration(
     path: Path | str, *, width: int, height: int, monocular: bool = False
 ) -> Camera:
     """Read the projection matrices P0 and P1 from ``calib.txt``.
-
-    Lines may begin with the name of the matrix, such as ``P0:``.
 
     Args:
         width: image width in pixels. The file does not state the image size.
@@ -184,14 +181,9 @@ def _by_number(stem: str) -> tuple[int, str]:
     return (int(stem) if stem.isdecimal() else -1, stem)
 
 
-def _check_frames(
+def _files_of_frames(
     folder: Path, sides: list[dict[str, Path]], stems: list[str]
 ) -> list[tuple[Path, ...]]:
-    """List the image files of the given frames for each camera. A frame is named by its file stem.
-
-    Raises:
-        InputError: a camera has no images, or an image of a frame is missing.
-    """
     for side, images in enumerate(sides):
         if not images:
             instead = ", or run on the left camera alone with --sensor mono" if side else ""
@@ -225,7 +217,7 @@ def _read_times(path: Path) -> NDArray[np.float64]:
 
 
 def _row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]:
-    """For each image, return the index of its row in ``times.txt`` or in the file of the poses."""
+    """Return the row of each image in ``times.txt`` or in the file of the poses, from 0."""
     fix = "take the file of this sequence from KITTI's archives"
     if n_rows < len(stems):
         raise InputError(f"{path}: only {n_rows} rows for {len(stems)} images; {fix}.")

@@ -72,7 +72,7 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
 
 
 def _queue(dai: Any, pipeline: Any, sensor: str) -> Any:
-    """Make a queue that holds only the newest pair of synchronised images, left and second."""
+    """Make a queue that holds only the newest pair of images, ``left`` and ``second``."""
     create, node, socket = pipeline.create, dai.node, dai.CameraBoardSocket
 
     def output(side: Any, kind: Any = None, *, undistorted: bool = False) -> Any:
@@ -103,7 +103,6 @@ def _queue(dai: Any, pipeline: Any, sensor: str) -> Any:
 
 
 def _calibration(dai: Any, device: Any, images: Any, sensor: str) -> Calibration:
-    """Read the calibration from the memory of the device and from its first images."""
     socket, memory = dai.CameraBoardSocket, device.readCalibration()
     source = f"the calibration in oakd {device.getDeviceId()}"
     left = _model(images["left"], source)
@@ -118,7 +117,7 @@ def _calibration(dai: Any, device: Any, images: Any, sensor: str) -> Calibration
 
 
 def _model(image: Any, source: str) -> CameraModel:
-    """Return the camera model of an image that the device has undistorted."""
+    """The device must have undistorted the image."""
     transformation = image.getTransformation()
     if any(transformation.getDistortionCoefficients()):
         raise InputError(

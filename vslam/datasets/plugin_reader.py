@@ -31,8 +31,8 @@ def open_plugin(
 ) -> Source:
     """Let a plug-in open a source, and select frames of the source.
 
-    A plug-in may also fail later, when a frame is read. If the frames can be read in any order,
-    only this frame is skipped. If the source is a stream, the stream ends at this frame.
+    A plug-in may also fail later, when a frame is read. If the frames are stored, only this frame
+    is skipped. If the source is a stream, the stream ends at this frame.
 
     Raises:
         InputError: the plug-in rejects its input, fails, or returns no valid `Source`.
@@ -58,10 +58,7 @@ def open_plugin(
 
 
 def _wrong_source(raw: object) -> str:
-    """Check the object that a plug-in returned.
-
-    Returns why the object is not a valid source, or an empty text if it is valid.
-    """
+    """Say why an object that a plug-in returned is not a valid source; empty if it is valid."""
     if not isinstance(raw, Source):
         return f"returned {type(raw).__name__}, not vslam.datasets.frames.Source"
     if not isinstance(raw.camera, Camera):
@@ -91,11 +88,7 @@ def _play(plugin: PlugIn, raw: Source, checked: partial[TimedFrame]) -> Iterator
 
 
 def _checked(plugin: PlugIn, root: Path, camera: Camera, frame: TimedFrame, at: str) -> TimedFrame:
-    """Return a frame whose images are checked whenever they are read.
-
-    The images of the given frame are used. They must have the types and sizes that the calibration
-    of the camera demands.
-    """
+    """Make a frame that checks the images of ``frame`` whenever they are read."""
 
     def read(image_map: ImageMap) -> Images:
         try:
@@ -114,10 +107,7 @@ def _checked(plugin: PlugIn, root: Path, camera: Camera, frame: TimedFrame, at: 
 
 
 def _wrong_images(left: Image, second: Image | DepthImage | None, camera: Camera) -> str:
-    """Describe the types and shapes of images that do not match the calibration of the camera.
-
-    The text is empty if the images match the calibration.
-    """
+    """Describe images whose types or sizes do not match the calibration; empty if they match."""
     kinds: list[np.dtype[Any]] = [np.dtype(np.uint8)]
     if not camera.monocular:
         kinds.append(np.dtype(np.float32 if camera.depth else np.uint8))

@@ -4,8 +4,8 @@ PNG predicts every pixel from its neighbours above and on the left, and stores o
 This is called a line filter. OpenCV's decoder needs as much time to undo these filters as to
 decompress the data, because every pixel depends on the pixel on its left.
 
-This decoder decodes 32 lines at once as a wavefront: in each line, decoding is one pixel behind the
-line above it. A vector register holds one pixel of each line.
+This decoder decodes 32 lines at once. In each line, decoding is one pixel behind the line above it.
+A vector register holds one pixel of each line.
 
 Some filters predict each pixel from at most one neighbour. If a block of lines has only such
 filters, it is decoded line by line, because this is faster. All files that OpenCV writes have only
@@ -38,7 +38,7 @@ def decode_png(data: bytes) -> NDArray[np.uint8] | None:
     """Decode a PNG file of 8-bit grey levels to ``(H, W)`` uint8, exactly as libpng does.
 
     Returns None if the file has a different format, is interlaced, or is damaged according to its
-    checksums. The caller can then try a different decoder.
+    checksums.
     """
     import deflate
 
@@ -56,11 +56,7 @@ def decode_png(data: bytes) -> NDArray[np.uint8] | None:
 
 
 def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
-    """Read the height, the width and the compressed image data of a PNG file.
-
-    Raises:
-        ValueError, struct.error: the file has another format, or is damaged.
-    """
+    """Read the height, the width and the compressed image data of a PNG file."""
     chunks = _chunks(data)
     kind, header = next(chunks, (b"", b""))
     width, height, *form = struct.unpack(">II5B", header)
@@ -78,11 +74,7 @@ def _contents(data: bytes) -> tuple[tuple[int, int], bytes]:
 
 
 def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield the kind and the contents of every chunk of a PNG file except the last chunk.
-
-    Raises:
-        ValueError, struct.error: the file is truncated, or a checksum is wrong.
-    """
+    """Yield the kind and the contents of every chunk of a PNG file except the last chunk."""
     import deflate
 
     if not data.startswith(SIGNATURE):
@@ -106,7 +98,7 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
 def is_cut_off(data: bytes) -> bool:
     """Return whether a PNG file is truncated, so that one of its chunks is incomplete.
 
-    libpng would allocate the stated length, up to 2 GB, before it reads the chunk.
+    libpng would allocate the stated length of the chunk, up to 2 GB, before it reads the chunk.
     """
     at = len(SIGNATURE)
     while data.startswith(SIGNATURE) and at + _CHUNK.size <= len(data):
@@ -120,9 +112,7 @@ def is_cut_off(data: bytes) -> bool:
 
 
 def decode_with_opencv(data: bytes, flags: int) -> NDArray[Any] | None:
-    """Decode a file of any format using ``cv2.imdecode``.
-
-    Returns None if the file cannot be decoded, or if `is_cut_off` finds that it is truncated.
+    """Decode an image file of any format using ``cv2.imdecode``; None if it cannot be decoded.
 
     Raises:
         cv2.error: the image is too large, or the file is empty.
@@ -137,8 +127,8 @@ def unfilter(lines, image):
     """Undo the line filters of a decompressed image.
 
     The lines are decoded in blocks of `LANES`. Each step decodes one pixel of every line of the
-    block. In each line, decoding is one pixel behind the line above it. Therefore, the neighbours
-    that predict a pixel have always been decoded in earlier steps.
+    block. In each line, decoding is one pixel behind the line above it, so that the neighbours that
+    predict a pixel are already decoded.
 
     Args:
         lines: ``(H, W + 1)`` uint8. Each line begins with the number of its filter.
@@ -187,7 +177,7 @@ def unfilter(lines, image):
 
 @inner_kernel
 def largest_filter(lines):
-    """Return the largest number of a filter that the lines use."""
+    """Return the largest filter number of the lines."""
     largest = np.uint8(0)
     for y in range(len(lines)):
         largest = max(largest, lines[y, 0])

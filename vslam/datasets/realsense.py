@@ -119,11 +119,10 @@ def _calibration(rs: Any, profile: Any, depth_sensor: Any, sensor: str, serial: 
 
 
 def _model(rs: Any, intrinsics: Any, source: str) -> CameraModel:
-    """Return the camera model of a stream.
+    """Both Brown-Conrady models of librealsense are treated as OpenCV's distortion model.
 
-    Both Brown-Conrady models of librealsense are treated as OpenCV's distortion model. The model
-    named "inverse" differs from OpenCV's model by second-order terms. For the lens of a D455, this
-    difference amounts to 0.01 px.
+    The model named "inverse" differs from OpenCV's model by second-order terms. For the lens of a
+    D455, this difference amounts to 0.01 px.
     """
     i = intrinsics
     known = rs.distortion.brown_conrady, rs.distortion.inverse_brown_conrady

@@ -18,14 +18,14 @@ from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame, d
 from vslam.datasets.image_files import with_depth
 from vslam.errors import InputError
 
-# Words for the columns and rows that an encoder has cut off, by their numbers.
+# Names of what an encoder has cut off, by the numbers of missing columns and rows.
 _MISSING = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}
 
 
 def rectified(raw: RawSource, calibration: Calibration) -> Source:
     """Make a source whose images are rectified when they are read.
 
-    The rectification maps are computed once. Images that are already rectified stay unchanged.
+    Images that are already rectified stay unchanged.
 
     Raises:
         InputError: the images do not have the calibrated size, the calibration of the right camera
@@ -99,7 +99,6 @@ def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFr
 
 
 def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) -> Images:
-    """Read and rectify the images of a frame. Depth is taken from the nearest pixel."""
     left, second = frame.read(image_map)
     sides: list[Callable[[], Image | DepthImage]] = [partial(rectification.left, left)]
     if second is not None and rectification.camera.depth:

@@ -44,9 +44,8 @@ class SourceOptions(BaseModel):
             reads all images of the source.
         mask: mask for all left images, or folder with a mask for each left image, see
             `vslam.datasets.masks.with_masks`.
-        start: index of the first frame to read.
-        every: read only every ``every``-th frame.
-        max_frames: largest number of frames to read; None reads all.
+        start, every, max_frames: read the frames ``start``, ``start + every`` and so on, at most
+            ``max_frames`` frames.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -82,13 +81,11 @@ _NOT_MONOCULAR = ("right", "depth", "depth_scale")
 def open_source(
     options: SourceOptions, on_render: Callable[[int, int], None] | None = None
 ) -> Source:
-    """Open a data set, or the images of any camera.
-
-    If the images are not rectified yet, they are rectified using the calibration.
+    """Open a data set, or the images of any camera. Images that are not rectified are rectified.
 
     Args:
-        on_render: called after each rendered frame, with the number of frames that are rendered so
-            far and the total number.
+        on_render: called after each rendered frame, with the number of frames rendered so far and
+            the total number.
 
     Raises:
         InputError: an option does not apply to this source, the source does not have the images of
@@ -176,7 +173,7 @@ def open_raw(options: SourceOptions) -> RawSource:
 def _open_stream(
     dataset: str, options: SourceOptions, monocular: bool
 ) -> tuple[RawSource, Calibration | None]:
-    """Open a video, bag or camera, and read the calibration if a bag or depth camera stores it."""
+    """Return the source, and the calibration that a bag or depth camera stores."""
     o = options
     raw: RawSource
     own: Calibration | None = None

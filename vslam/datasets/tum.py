@@ -59,19 +59,17 @@ def open_tum(
     calib: Several[Path | str] = (),
     depth_scale: float | None = None,
 ) -> Source:
-    """Open a sequence. Its images are undistorted when they are read.
+    """Open a sequence of TUM. Its images are undistorted when they are read.
 
-    A frame consists of a colour image and a depth image that are less than 20 ms apart.
-    `vslam.datasets.association.associate` pairs them in the same way as TUM's ``associate.py``.
-    `vslam.datasets.association.poses_at` interpolates the ground truth.
+    A frame consists of a colour image and a depth image that are less than 20 ms apart, paired as
+    TUM's ``associate.py`` does. The ground truth is interpolated at the times of the frames.
 
     Args:
         root: folder of the sequence, or a folder that contains several sequences.
         name: name of the sequence in ``root``. None opens ``root`` itself or, if it is not a
             sequence, the only sequence in it.
-        start: index of the first pair to read.
-        every: read only every ``every``-th pair.
-        max_frames: largest number of pairs to read; None reads all.
+        start, every, max_frames: read the frames ``start``, ``start + every`` and so on, at most
+            ``max_frames`` frames.
         monocular: read only the colour images. Depth images need not exist.
         calib: calibration file. If it is given, it is used instead of the calibration in the folder
             and instead of the calibration of TUM's cameras.
@@ -127,7 +125,7 @@ def open_tum(
 
 
 def is_tum(folder: Path) -> bool:
-    """Return whether a folder contains a sequence in this layout."""
+    """Return whether a folder contains a sequence in TUM's layout."""
     return (folder / "rgb.txt").is_file()
 
 

@@ -37,7 +37,7 @@ _MISSING_SHARE = 0.05
 
 
 def open_capture(source: str | int, *parameters: int) -> Capture | None:
-    """Open a video file, URL or camera. Returns None if OpenCV cannot open it.
+    """Open a video file, URL or camera. None if OpenCV cannot open it.
 
     Args:
         parameters: properties of OpenCV's capture, each followed by its value.
@@ -167,7 +167,6 @@ def open_video(
 
 
 def _check_sides(source: str, side_by_side: bool, monocular: bool) -> None:
-    """Check that ``side_by_side`` is set for stereo, because each frame of a video is one image."""
     if not side_by_side and not monocular:
         raise InputError(
             f"{source} has one image per frame; use --side-by-side if each frame holds both "

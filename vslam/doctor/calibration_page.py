@@ -26,7 +26,7 @@ _COVERED = 0.6  # least share of cells with corners; a whole board hardly reache
 _LARGE_PX = 0.5  # largest RMS, for images of at most the common width; it grows with the width
 _COMMON_WIDTH = 640
 _APART_PX = 2.0  # largest RMS of the pair; a larger error means that the board moved
-_SHARED = 0.2  # largest systematic share of the squared residuals (_shared)
+_SHARED = 0.2  # largest systematic share of the squared residuals (_systematic_share)
 _MOST_DROPPED = 0.25
 _ARROW = 0.02  # length of an arrow of the RMS error, relative to the image width
 
@@ -54,8 +54,9 @@ def write_page(
 ) -> None:
     """Write a self-contained HTML page about a calibration.
 
-    ``about`` is a line that is shown below the title. ``text`` is the content of the calibration
-    file.
+    Args:
+        about: line below the title.
+        text: content of the calibration file.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -96,12 +97,12 @@ def _camera(side: str, fit: CameraFit) -> list[Finding]:
         views = Finding(views.check, "fault", f"{views.measured}, too few", fix)
     facing = np.abs(fit.T_camera_board[:, 2, 2])  # cosine of the angle
     tilted = int(np.count_nonzero(facing < np.cos(np.radians(_TILT))))
-    cells = _cells(fit)
+    cells = _cells_of_corners(fit)
     full = np.bincount(cells, minlength=_CELLS[0] * _CELLS[1]).reshape(_CELLS) > 0
     share = float(full.mean())
     parts = {"left": full[:2], "right": full[-2:], "top": full[:, :2], "bottom": full[:, -2:]}
     emptiest = min(parts, key=lambda name: float(parts[name].mean()))
-    shared = _shared(cells, np.concatenate(fit.residuals))
+    shared = _systematic_share(cells, np.concatenate(fit.residuals))
     return [
         views,
         judge(
@@ -135,7 +136,7 @@ def _kept(check: str, n: int, dropped: Sequence[tuple[str, float]]) -> Finding:
     return judge(check, len(dropped) > _MOST_DROPPED * (n + len(dropped)), measured, fix)
 
 
-def _cells(fit: CameraFit) -> NDArray[np.int64]:
+def _cells_of_corners(fit: CameraFit) -> NDArray[np.int64]:
     """Divide the image into cells, and return the cell number of each detected board corner.
 
     The corners of all views of the board are included. Cells are numbered column by column.
@@ -145,11 +146,11 @@ def _cells(fit: CameraFit) -> NDArray[np.int64]:
     return np.asarray(x * _CELLS[1] + y, np.int64)
 
 
-def _shared(cells: NDArray[np.int64], residuals: Array) -> float:
+def _systematic_share(cells: NDArray[np.int64], residuals: Array) -> float:
     """Return the systematic fraction of the squared reprojection errors, from 0 to 1.
 
-    It is the fraction of the squared errors that is explained by the mean error in each cell of the
-    image. It is about 0 for noise, and close to 1 for a camera model that does not fit the lens.
+    It is the fraction that is explained by the mean error in each cell of the image. It is about 0
+    for noise, and close to 1 for a camera model that does not fit the lens.
     """
     n = np.bincount(cells)
     sums = np.stack([np.bincount(cells, weights=column) for column in residuals.T], axis=1)

@@ -45,10 +45,10 @@ LONG_GAP = 3.5  # a longer step, in intervals, means that several frames in a ro
 DEPTH_PX = 4.0  # largest shift; depth edges of structured light are off by 2 to 3 px
 DEPTH_SHARE = 0.3  # smallest share of pixels with a depth
 # Misregistered depth is reported only if the fit has one clear peak away from shift 0. Heights are
-# measured above the median of the fit, relative to the highest peak. For correct depth, in nine
-# parts of TUM fr1/desk, the height near shift 0 is at least 0.67, or the height of the second peak
-# is 0.85. If the depth is shifted by 20 px, the height near shift 0 is 0.25 to 0.66. The height of
-# the second peak is then mostly 0.65 to 0.77.
+# measured above the median of the fit, relative to the highest peak. The limits were measured in
+# nine parts of TUM fr1/desk. With correct depth, the height near shift 0 was at least 0.67, or the
+# second peak had the height 0.85. With depth that was shifted by 20 px, the height near shift 0 was
+# 0.25 to 0.66. The height of the second peak was then mostly 0.65 to 0.77.
 DEPTH_AT_ZERO = 0.6
 DEPTH_SECOND = 0.8
 _ANOTHER_PX = 8.0  # smallest distance of the second peak from the highest peak
@@ -66,10 +66,7 @@ _REACH = 16, 48  # px, vertical and horizontal search range; the sensors are sid
 
 
 def check_rectification(matches: Matches) -> Finding:
-    """Check the rectification of a stereo pair, using the row differences of stereo matches.
-
-    In a rectified pair, both points of a match lie in the same row.
-    """
+    """Check that both points of a stereo match lie in the same row, as in a rectified pair."""
     rows = float(np.median(np.abs(matches.left[:, 1] - matches.right[:, 1])))
     return judge(
         "rectification",
@@ -80,10 +77,7 @@ def check_rectification(matches: Matches) -> Finding:
 
 
 def check_sides(matches: Matches) -> Finding:
-    """Check that the left and right images are not swapped.
-
-    If they are swapped, disparities have the wrong sign.
-    """
+    """Check that left and right images are not swapped, which would make disparities negative."""
     disparity = matches.left[:, 0] - matches.right[:, 0]
     in_front = float(np.mean(disparity > -ROWS_PX))
     middle = float(np.median(disparity))
@@ -188,8 +182,9 @@ def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, in
     the right images of the same frames.
 
     Args:
-        rows_of_lag: median vertical error of stereo matches (px) by lag. The lag is the delay of
-            the right image in frames. The dictionary is empty if no frame has matches for all lags.
+        rows_of_lag: median vertical error of stereo matches (px) for each lag, which is the delay
+            of the right image in frames. The dictionary is empty if no frame has matches for all
+            lags.
 
     Returns:
         The finding, and the best lag. The lag is 0 if the camera hardly moves.
@@ -229,7 +224,7 @@ def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
 
 
 def check_sharpness(images: Sequence[Image]) -> Finding:
-    """Check that images are not blurred, using the median of the ``sharpness`` of all images."""
+    """Check that images are not blurred, using the median of their `sharpness`."""
     values = [sharpness(image) for image in images]
     middle = float(np.median(values))
     return judge(
@@ -241,7 +236,7 @@ def check_sharpness(images: Sequence[Image]) -> Finding:
 
 
 def sharpness(image: Image) -> float:
-    """Compare the contrast of neighbouring pixels with the contrast in a wider neighbourhood.
+    """Return the contrast of neighbouring pixels relative to that of a wider neighbourhood.
 
     The ratio is 0 for an image without fine detail, and about 1 for white noise.
     """
@@ -320,8 +315,8 @@ def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Findin
 def _registration(fit: NDArray[np.float32], views: Callable[[], int]) -> Finding:
     """Check whether depth edges fit the image edges best without a shift.
 
-    If a different shift fits best, this is a fault only under two conditions. The shift must be the
-    single clear peak inside the search range, and more than one view must have been examined.
+    A different best shift is a fault only under two conditions. It must be the single clear peak
+    inside the search range, and more than one view must have been examined.
     """
     reach = np.array(_REACH)
     best = np.array(np.unravel_index(np.argmax(fit), fit.shape)) - reach
@@ -364,9 +359,9 @@ def _edge_fit(image: Image, depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def depth_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Find the pixels at which the depth changes abruptly, by more than a tenth.
+    """Return the ``(H, W)`` bool pixels at which the depth changes by more than a tenth.
 
-    The result is ``(H, W)`` bool. A depth of 0 means that the depth is unknown.
+    A depth of 0 means that the depth is unknown.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         log = np.where(depth > 0, np.log(depth), np.nan)

@@ -54,7 +54,6 @@ class Diagnosis:
 
     @property
     def faults(self) -> list[Finding]:
-        """The findings that are faults."""
         return [finding for finding in self.findings if finding.verdict == "fault"]
 
 
@@ -104,11 +103,7 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
 
 
 def _examine_mask(sequence: Source, lefts: dict[int, Image]) -> tuple[list[Finding], list[Picture]]:
-    """Measure which fraction of the image the mask hides, and draw the hidden part in red.
-
-    The picture shows the first image. The result is a list of findings and a list of pictures. Both
-    lists are empty if there is no mask.
-    """
+    """Measure how much of the image the mask hides, and draw this part of it in red."""
     frame = next(iter(lefts), None)
     read = None if frame is None else sequence.stored[frame].mask
     if frame is None or read is None:
@@ -138,11 +133,8 @@ class _Pair:
         return float(np.median(np.abs(self.matches.left[:, 1] - self.matches.right[:, 1])))
 
 
-def _pairs(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
-    """Match each left image with the right image that was taken ``lag`` frames later.
-
-    Pairs whose right image is missing or cannot be read are left out.
-    """
+def _pairs_with_lag(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
+    """Match each left image with the right image that was taken ``lag`` frames later."""
     found = []
     for frame, left in lefts.items():
         try:
@@ -159,7 +151,7 @@ def _examine_stereo(
     sequence: Source, lefts: dict[int, Image], *, few_features: bool
 ) -> tuple[list[Finding], list[Picture]]:
     inner = dict(list(lefts.items())[1:-1:2])  # frames that have frames before and after them
-    by_lag = {lag: _pairs(sequence, inner if lag else lefts, lag) for lag in _LAGS}
+    by_lag = {lag: _pairs_with_lag(sequence, inner if lag else lefts, lag) for lag in _LAGS}
     pairs = by_lag[0]
     if not any(len(pair.matches) for pair in pairs):
         fix = "the images do not overlap: check that they form a pair, and their calibration"
@@ -221,10 +213,7 @@ def _track(sequence: Source, frame: int) -> Moved | None:
 def _disparities(
     xy: NDArray[np.float32], left: Image, second: Image | DepthImage, camera: Camera
 ) -> NDArray[np.float64]:
-    """Compute the ``(N,)`` disparities of ``(N, 2)`` keypoints of the left image.
-
-    An unknown disparity is 0.
-    """
+    """Return ``(N,)`` disparities of ``(N, 2)`` keypoints of the left image, 0 where unknown."""
     if second.dtype != np.uint8:
         x, y = np.rint(xy).astype(int).T
         depth = np.asarray(second, np.float64)[y, x]
@@ -240,10 +229,9 @@ def _disparities(
 
 
 def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
-    """For each lag, return the median vertical error of stereo matches in pixels.
+    """Return the median row error of stereo matches (px) by delay of the right image (frames).
 
-    The lag is the delay of the right image in frames. Only frames that have matches for all lags
-    are used.
+    Only frames that have matches for all delays are used.
     """
     rows = {
         lag: {pair.frame: pair.rows for pair in pairs if len(pair.matches)}
@@ -258,10 +246,7 @@ def _rows_by_lag(by_lag: dict[int, list[_Pair]]) -> dict[int, float]:
 
 
 def _stereo_picture(pair: _Pair) -> Picture:
-    """Draw both images of a stereo pair side by side, with a line for each match.
-
-    The line is green if the rows of the two points agree.
-    """
+    """Draw a stereo pair side by side. The line of a match is green if its two rows agree."""
     left, right, matches = pair.left, pair.right, pair.matches
     height, width = left.shape
     begin = width + _GAP  # first column of the right image
@@ -286,7 +271,6 @@ def _stereo_picture(pair: _Pair) -> Picture:
 
 
 def _depth_picture(image: Image, depth: checks.Depth) -> Picture:
-    """Draw the edges of a depth image over the colour image."""
     drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     drawn[checks.depth_edges(np.nan_to_num(depth.astype(np.float32)))] = _RED
     caption = "Depth edges in red. They lie on the edges of objects if the depth is registered."
@@ -295,8 +279,6 @@ def _depth_picture(image: Image, depth: checks.Depth) -> Picture:
 
 def write_page(diagnosis: Diagnosis, title: str, path: Path) -> None:
     """Write the result of an examination as self-contained HTML.
-
-    Faults and their fixes come first. The other checks follow.
 
     Raises:
         ResultsError: the file cannot be written.

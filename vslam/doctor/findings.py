@@ -30,11 +30,7 @@ class Finding:
 
 
 def judge(check: str, wrong: bool, measured: str, fix: str) -> Finding:
-    """Create the finding of a check.
-
-    If ``wrong`` is True, the verdict is ``fault``, and the finding contains the advice ``fix``.
-    Otherwise, the verdict is ``good``.
-    """
+    """Create the finding of a check: a fault with the advice ``fix`` if ``wrong``."""
     return Finding(check, "fault", measured, fix) if wrong else Finding(check, "good", measured)
 
 
@@ -47,10 +43,7 @@ def lines(findings: Iterable[Finding]) -> Iterator[str]:
 
 
 def sections(findings: Sequence[Finding]) -> list[Section]:
-    """Format findings as sections of a page.
-
-    Faults and their fixes come first. The other checks follow.
-    """
+    """Format findings as sections of a page. Faults and their fixes come first."""
     faults = [
         Alert(f"{f.check.capitalize()}: {f.measured}.", f.fix and f"Fix: {f.fix}.")
         for f in findings

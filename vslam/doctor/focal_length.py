@@ -127,7 +127,6 @@ def _best_pose(
 
 
 def _fits(moved: Moved, camera: Camera, factor: float, pose: Vectors) -> bool:
-    """Return whether most points agree with an estimated motion between two frames."""
     error, variance, _ = _errors(moved, camera, factor, pose)
     return float(np.median((error**2).sum(axis=1) / variance)) < _CAUCHY
 
@@ -158,11 +157,7 @@ def _project(
 
 
 def _jacobian(points: Vectors, camera: Camera, factor: float, pose: Vectors) -> Vectors:
-    """Compute the derivatives of pixel positions with respect to the motion of the camera.
-
-    Returns:
-        ``(N, 2, 6)`` derivatives with respect to rotation and translation.
-    """
+    """Return the ``(N, 2, 6)`` derivatives of pixel positions by rotation and translation."""
     x, y, z = points.T
     z = np.maximum(z, 1e-3 * camera.baseline)
     zero = np.zeros_like(z)

@@ -57,7 +57,7 @@ def match_images(left: Image, right: Image) -> Matches:
     a = np.array([kp_left[match.queryIdx].pt for match in found], np.float32)
     b = np.array([kp_right[match.trainIdx].pt for match in found], np.float32)
     refined, tracked, _ = cv2.calcOpticalFlowPyrLK(
-        left, _normalised(right, left), a, b.copy(), winSize=_WINDOW, maxLevel=0,
+        left, _with_contrast_of(right, left), a, b.copy(), winSize=_WINDOW, maxLevel=0,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     near = (tracked.ravel() == 1) & (np.linalg.norm(refined - b, axis=1) < _REFINED_PX)
@@ -87,18 +87,15 @@ def _same_view(image: Image, other: Image) -> bool:
 
 
 def joined(several: list[Matches]) -> Matches:
-    """Join the matches of several image pairs into one object. At least one pair is needed."""
+    """Join the matches of one or more image pairs."""
     return Matches(
         np.concatenate([matches.left for matches in several]),
         np.concatenate([matches.right for matches in several]),
     )
 
 
-def _normalised(image: Image, model: Image) -> Image:
-    """Adjust the brightness and contrast of an image to those of another image.
-
-    Optical flow assumes that both images have the same brightness and contrast.
-    """
+def _with_contrast_of(image: Image, model: Image) -> Image:
+    """Give an image the mean and the contrast of ``model``, as optical flow assumes."""
     gain = float(model.std()) / max(float(image.std()), 1.0)
     shifted = (image.astype(np.float32) - image.mean()) * gain + model.mean()
     return np.clip(np.rint(shifted), 0, 255).astype(np.uint8)

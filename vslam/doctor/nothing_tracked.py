@@ -48,10 +48,7 @@ def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:
 
 
 def _negative_disparity(source: Source) -> float | None:
-    """Return the median disparity (px) of a few frames if left and right seem to be swapped.
-
-    The disparity is negative in this case. Otherwise, the result is None.
-    """
+    """Return the median disparity (px) of a few frames if left and right seem to be swapped."""
     found = []
     try:
         for frame in islice(source.frames(), _FRAMES):

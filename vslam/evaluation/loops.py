@@ -43,8 +43,8 @@ class Revisits:
 
     Attributes:
         first, last: ``(M,)`` index of the first and of the last frame of each stretch.
-        first_match, last_match: ``(M,)`` indices of earlier frames. They were taken at the same
-            places as the frames ``first`` and ``last``.
+        first_match, last_match: ``(M,)`` indices of the earlier frames that were taken nearest to
+            the frames ``first`` and ``last``.
         length_m: ``(M,)`` length of each stretch in metres.
     """
 
@@ -78,7 +78,7 @@ class LoopEvaluation:
 
     @property
     def n_found(self) -> int:
-        """Number of revisited stretches of the path on which a correct loop was closed.
+        """Number of stretches of ``revisits`` on which a correct loop was closed.
 
         One loop per stretch is sufficient, because tracking then continues in the old part of the
         map.
@@ -87,15 +87,15 @@ class LoopEvaluation:
 
     @property
     def n_missed(self) -> int:
-        """Number of revisited stretches of the path on which no correct loop was closed."""
+        """Number of stretches of ``revisits`` on which no correct loop was closed."""
         return len(self.revisits) - self.n_found
 
 
 def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
     """Compare the loops of a run with the ground truth of its frames.
 
-    The result is None if a frame has no ground truth, because revisits cannot be found on a path
-    with gaps.
+    Returns None if a frame has no ground truth, because revisits cannot be found on a path with
+    gaps.
     """
     truth = ground_truth_of(outcome.sequence)
     if truth is None or not len(outcome.trajectory):
@@ -113,11 +113,10 @@ def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
 
 
 def metres_per_unit(T_wc: Poses, T_wc_true: Poses) -> NDArray[np.float64]:
-    """Return the length of the unit of a monocular map at each frame, as ``(N,)`` metres.
+    """Return how many metres one unit of a monocular map is long at each of N frames, ``(N,)``.
 
-    For consecutive frames, the true distance is divided by the estimated distance. The result is
-    the median of these ratios over the 41 frames around each frame. The result is 1 if the camera
-    did not move.
+    The length is the median ratio of the true to the estimated distance between consecutive frames,
+    over the 41 frames around each frame. It is 1 if the camera did not move.
 
     Args:
         T_wc: ``(N, 4, 4)`` poses at the time of tracking.
@@ -147,10 +146,10 @@ def _in_metres(edge: LoopEdge, metres: float) -> LoopEdge:
 def revisits(T_wc: Poses, timestamps: NDArray[np.float64]) -> Revisits:
     """Find the stretches of a path along which the camera had already travelled earlier.
 
-    Only earlier passages in the same direction count. A frame is a revisit if the camera passed
-    within ``MAX_LATERAL_M`` of the same position earlier, with a heading that differed by at most
-    ``MAX_HEADING_DEG``. Between the two passages, there must be at least ``MIN_SECONDS`` and a path
-    of at least ``MIN_PATH_M``. The camera is assumed to move on a straight line between two frames.
+    A frame is a revisit if the camera passed within ``MAX_LATERAL_M`` of the same position earlier,
+    with a heading that differed by at most ``MAX_HEADING_DEG``. Between the two passages, there
+    must be at least ``MIN_SECONDS`` and a path of at least ``MIN_PATH_M``. The camera is assumed to
+    move on a straight line between two frames.
 
     Args:
         T_wc: ``(N, 4, 4)`` true poses.
@@ -191,14 +190,12 @@ def judge_loops(
     T_wc: Poses,
     timestamps: NDArray[np.float64],
 ) -> LoopEvaluation:
-    """Determine whether each loop edge is right, and whether each revisit was found by a loop.
+    """Determine which loop edges are right, and which revisits were found by a loop.
 
     An edge is right if ``T_query_match`` agrees with the ground truth within ``MAX_TRANSLATION_M``
-    and ``MAX_ROTATION_DEG``. An accepted edge that is right counts as finding a revisited stretch
-    if two conditions are met. First, the match of the edge must belong to an earlier passage, not
-    to the frames directly before the query. Second, the query of the edge must lie on the stretch
-    or within ``MAX_INTERRUPTION_M`` of it. This tolerance is needed because the camera sees a place
-    shortly before it reaches the place and shortly after it leaves the place.
+    and ``MAX_ROTATION_DEG``. A revisit is found if an accepted and right edge connects one of its
+    frames to an earlier passage. The query of the edge may also lie up to ``MAX_INTERRUPTION_M``
+    before or after the revisit, because the camera sees a place from some distance.
 
     Args:
         edges: accepted and rejected loops.
@@ -256,8 +253,7 @@ def _earlier_passage(
     """For each of S samples of the path, find the nearest sample of an earlier passage.
 
     Returns:
-        ``(S,)`` index of the nearest earlier sample. It is -1 if the camera was not near this
-        sample earlier.
+        ``(S,)`` index of the nearest earlier sample, or -1 if there was no earlier passage.
     """
     from scipy.spatial import cKDTree
 

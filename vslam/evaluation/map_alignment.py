@@ -16,18 +16,18 @@ from vslam.run.outcome import RunOutcome
 
 
 def name_of_world(outcome: RunOutcome) -> str:
-    """Return the name of the world frame of the ground truth of a run.
+    """Return the name of the world frame of a run's ground truth.
 
-    All rendered drives along the same route have the same world frame, even if the light or the
-    traffic differs. Therefore, they have the same name.
+    What follows a ``+`` in the name of the sequence is left out, because rendered drives along one
+    route have the same world frame, even if the light or the traffic differs.
     """
     return f"{outcome.sequence.dataset} {outcome.sequence.name.partition('+')[0]}"
 
 
 def truth_alignment_of(outcome: RunOutcome, evaluation: Evaluation) -> TruthAlignment:
-    """Return the transformation from a map to its ground truth.
+    """Return the transformation from the map of a run to the ground truth.
 
-    It is the transformation that aligns the trajectory of the run that made the map.
+    It is the transformation that aligns the trajectory of the run.
     """
     truth = outcome.ground_truth
     assert truth is not None
@@ -37,10 +37,10 @@ def truth_alignment_of(outcome: RunOutcome, evaluation: Evaluation) -> TruthAlig
 
 
 def error_in_map(outcome: RunOutcome) -> float | None:
-    """Compute the error of localisation in the map that a run continued.
+    """Compute the error of localisation in the existing map that a run continued.
 
-    The error is the position RMSE in metres of the frames that were localised in this map. The
-    result is None if the transformation from this map to the ground truth of the run is unknown.
+    The error is the position RMSE in metres of the frames that were localised in this map. None if
+    the transformation from this map to the ground truth of the run is unknown.
     """
     alignment, truth = outcome.truth_alignment, outcome.ground_truth
     if alignment is None or truth is None or outcome.in_map is None:
@@ -54,10 +54,7 @@ def error_in_map(outcome: RunOutcome) -> float | None:
 
 
 def _similarity(T_wc: Matrix, aligned: Matrix) -> Matrix:
-    """Fit the ``(4, 4)`` similarity that maps poses to aligned poses.
-
-    Both arguments are ``(N, 4, 4)``.
-    """
+    """Fit the ``(4, 4)`` similarity that maps ``(N, 4, 4)`` poses to aligned poses."""
     spread, aligned_spread = (
         np.linalg.norm(T[:, :3, 3] - T[:, :3, 3].mean(axis=0)) for T in (T_wc, aligned)
     )

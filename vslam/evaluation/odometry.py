@@ -59,8 +59,8 @@ def motion_errors(
         tracks: result of tracking each frame. Frames without an uncertainty or without a true pose
             are not used.
         truth: true poses at the times of some or all frames.
-        interval_s: duration of a motion in seconds. Each motion ends at the first frame that is at
-            least ``interval_s`` later than the first frame of the motion.
+        interval_s: least duration of a motion in seconds. Each motion ends at the first frame that
+            is at least ``interval_s`` later than its first frame.
     """
     true_pose = dict(zip(truth.timestamps.tolist(), truth.T_wc, strict=True))
     usable = [

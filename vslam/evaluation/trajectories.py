@@ -31,9 +31,9 @@ class Evaluation:
         frames: number N of compared frames.
         alignment: ``se3``, ``sim3`` or ``none``, the kind of transformation that was fitted before
             the comparison.
-        on_one_line: whether all positions lie on one line. In this case, the positions do not
-            determine the rotation about this line, so this rotation was fitted to the orientations.
-            evo rejects such trajectories.
+        on_one_line: whether all positions lie on one line. Positions on a line do not determine the
+            rotation about the line, so that this rotation was fitted to the orientations. evo
+            rejects such trajectories.
         timestamps: ``(N,)`` timestamps of the estimate in seconds.
         ate_rmse_m, ate_mean_m, ate_max_m: RMSE, mean and maximum of ``errors_m``.
         errors_m: ``(N,)`` distance of each aligned position from the ground truth, in metres.
@@ -72,16 +72,16 @@ def evaluate_trajectory(
 ) -> Evaluation:
     """Compare an estimated trajectory with the ground truth.
 
-    The alignment is ``se3`` or ``sim3``. With ``none``, the trajectories are compared without
-    alignment.
-
-    Two trajectories with the same timestamps are compared frame by frame. Otherwise, each pose is
-    compared with the true pose that is nearest in time, if the two timestamps differ by at most 10
-    ms. ``Evaluation.frames`` is the number of such pairs.
+    Two trajectories of equal length whose timestamps agree within 10 ms are compared frame by
+    frame. Otherwise, each pose of the shorter trajectory is compared with the pose of the longer
+    trajectory that is nearest in time, if the two timestamps differ by at most 10 ms.
 
     ATE is the RMSE of the positions [Sturm et al., IROS 2012] after alignment by Umeyama's method
-    (TPAMI 1991). With ``se3``, no scale is fitted. RPE is computed from one frame to the next.
-    KITTI's drift is computed by ``kitti_drift``.
+    (TPAMI 1991). RPE is computed from one frame to the next. KITTI's drift is computed by
+    `kitti_drift`.
+
+    Args:
+        alignment: ``se3`` fits no scale, ``sim3`` fits a scale, and ``none`` fits nothing.
 
     Raises:
         InputError: the alignment is unknown, the trajectories have no common frames, or the camera
@@ -182,11 +182,7 @@ def _relative_errors(
 
 
 def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:
-    """Align an evo trajectory in place, and return whether its positions lie on one line.
-
-    Positions on a line do not determine the rotation about the line. In this case, a point to the
-    right of each camera and a point below it are aligned together with the positions.
-    """
+    """Align an evo trajectory in place, and return whether its positions lie on one line."""
     from evo import EvoException
     from evo.core.geometry import umeyama_alignment
     from evo.core.lie_algebra import se3
@@ -194,6 +190,7 @@ def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:
     try:
         estimate.align(reference, correct_scale=with_scale)
     except EvoException:
+        # Positions on a line do not determine the rotation about the line.
         rotation, translation, scale = umeyama_alignment(
             _with_axes(estimate), _with_axes(reference), with_scale
         )
@@ -205,10 +202,9 @@ def _align(estimate: Any, reference: Any, with_scale: bool) -> bool:
 
 
 def _with_axes(trajectory: Any) -> NDArray[np.float64]:
-    """Return the positions of a trajectory, and two more points for each pose.
+    """Return the positions of N poses, and two more points for each pose, as ``(3, 3N)``.
 
-    One of the two points lies to the right of the camera, and the other point lies below the
-    camera. The result is ``(3, 3N)``.
+    One point lies to the right of the camera, and one point lies below the camera.
     """
     T_wc = np.array(trajectory.poses_se3)
     position = T_wc[:, :3, 3]
@@ -218,14 +214,7 @@ def _with_axes(trajectory: Any) -> NDArray[np.float64]:
 
 
 def path_length(T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distance travelled up to each pose.
-
-    Args:
-        T_wc: ``(N, 4, 4)`` poses.
-
-    Returns:
-        ``(N,)`` metres.
-    """
+    """Return the ``(N,)`` distances in metres along the path up to each ``(N, 4, 4)`` pose."""
     steps = np.linalg.norm(np.diff(T_wc[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -244,8 +233,8 @@ def kitti_drift(
         T_wc_ground_truth: ``(N, 4, 4)`` ground truth of the same frames.
 
     Returns:
-        ``t_rel`` in percent and ``r_rel`` in degrees per 100 m. The result is None if the path is
-        shorter than 100 m.
+        ``t_rel`` in percent and ``r_rel`` in degrees per 100 m. None if the path is shorter than
+        100 m.
     """
     distances = path_length(T_wc_ground_truth)
     starts = np.arange(0, len(distances), _STEP_FRAMES)

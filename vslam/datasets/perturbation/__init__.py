@@ -61,16 +61,13 @@ black_left    % of the seconds in which the left image is black.
 
 Each law rounds its result and clips it to 8 bits.
 
-The laws at the end of the table, beginning with stereo_gain, change the image of only one camera.
-All other laws change both images in the same way. However, the random numbers for noise, night,
-shot, impulse, dirt and drops on the glass are drawn separately for each camera.
+The laws from stereo_gain to black_left change the image of only one camera. All other laws change
+both images in the same way. However, the random numbers for noise, night, shot, impulse, dirt and
+drops on the glass are drawn separately for each camera.
 
-Each law has its own random stream, so that the result of a law does not depend on other laws. The
-effect of a law on frame k depends only on the seed, on k and on the time of frame k. Therefore,
-frames may be read in any order. Random processes are defined on a fixed grid in time, so that
-dropped frames do not change the light. The processes are extended when frames arrive, so that the
-length of a stream is not limited. Laws of plug-ins (docs/howto/plugins.md) must follow the same
-rules.
+The effect of a law on frame k depends only on the seed, on k and on the time of frame k. Therefore,
+frames may be read in any order, and the result of a law does not depend on other laws. Laws of
+plug-ins (docs/howto/plugins.md) must follow the same rule.
 """
 
 from __future__ import annotations

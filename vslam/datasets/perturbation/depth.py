@@ -17,11 +17,10 @@ def dense_depths(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Estimate the depth of all pixels of a frame.
 
-    If the second image is a right image, the two images are matched using semi-global matching
-    (SGBM; Hirschmueller, PAMI 2008).
+    A left and a right image are matched using semi-global matching (SGBM; Hirschmueller, PAMI
+    2008).
 
     Args:
-        camera: calibration of the images.
         left: ``(H, W)`` uint8.
         second: right image, ``(H, W)`` uint8. For RGB-D, it is the depth of the left image's
             pixels, ``(H, W)`` float32 metres, 0 where unknown.
@@ -82,10 +81,10 @@ def disparity(
 
 
 def _filled(found: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Fill each pixel that has no disparity, using the two nearest disparities in its row.
+    """Fill each unknown pixel with the smaller of the two nearest disparities in its row.
 
-    The pixel gets the smaller one of the two disparities, because occluded pixels belong to the
-    background. This is the rule of Geiger et al., CVPR 2012.
+    The smaller disparity belongs to the background, which is what an occluded pixel shows (Geiger
+    et al., CVPR 2012).
     """
     known = found > 0
     columns = np.broadcast_to(np.arange(found.shape[1]), found.shape)

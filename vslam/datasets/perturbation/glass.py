@@ -80,10 +80,7 @@ def _blobs(share: float, seed: list[int], scene: Scene) -> NDArray[np.float32]:
 
 
 def _flare(greys: float, stream: RandomStream, scene: Scene) -> PairLaw:
-    """Add the glare of a sun that does not move in the image.
-
-    The sun is at the same place in both cameras, because it is far away.
-    """
+    """Add the glare of a distant sun that does not move in the images."""
     camera = scene.camera
     rng = np.random.default_rng(stream)
     sun = np.array([rng.uniform(0.15, 0.85) * camera.width, rng.uniform(0.05, 0.3) * camera.height])

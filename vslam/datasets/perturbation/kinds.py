@@ -18,10 +18,7 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError
 
 RandomStream = tuple[int, int]
-"""The user's seed, and a number for the law.
-
-The seeds of all random generators of the law begin with these two numbers.
-"""
+"""The user's seed, and a number for the law. All seeds of the law begin with these two numbers."""
 
 Law = Callable[[int, float, int, Image], Image]
 """A function ``(frame, t, side, image) -> image``, which returns an image of the same shape.
@@ -32,7 +29,7 @@ t is the time in seconds since the first frame. side is 0 for the left and 1 for
 
 @dataclass(frozen=True)
 class Pair:
-    """The images of one frame, which are passed from one law to the next.
+    """The images of one frame, which are passed from one perturbation to the next.
 
     Attributes:
         index: index of the frame.
@@ -79,7 +76,6 @@ class Scene:
 
     @classmethod
     def of(cls, source: Source) -> Scene:
-        """Return the data of a source that perturbations may use."""
         if not source.seekable:
             return cls(source.camera)
         times = source.timestamps
@@ -96,7 +92,7 @@ _UNMET: dict[Need, str] = {
 
 
 def check_need(law: str, need: Need, scene: Scene) -> None:
-    """Check that a source has the data that a law (kind of perturbation) needs.
+    """Check that a source has the data that the perturbation ``law`` needs.
 
     Raises:
         InputError: the source does not have this data.
@@ -112,14 +108,14 @@ def check_need(law: str, need: Need, scene: Scene) -> None:
 
 @dataclass(frozen=True)
 class SceneLaw:
-    """A perturbation that needs data of the source. It must be bound to a scene before use."""
+    """A perturbation that needs data of the source. `bound_to` must be called before use."""
 
     name: str
     needs: tuple[Need, ...]
     make: Callable[[Scene], PairLaw]
 
     def bound_to(self, scene: Scene) -> PairLaw:
-        """Return the perturbation for one source, whose data is in a scene.
+        """Return the perturbation for the source whose data ``scene`` contains.
 
         Raises:
             InputError: the source does not have the data that the perturbation needs.
@@ -171,7 +167,6 @@ class LawKind:
     sides: Literal["both", "one"] = "both"
 
     def law(self, name: str, strength: float, stream: RandomStream) -> PairLaw | SceneLaw:
-        """Make the perturbation of a given strength and seed."""
         if not self.of_scene:
             return EachSide(self.make(strength, stream))  # type: ignore[arg-type]
         return SceneLaw(name, self.needs, partial(self.make, strength, stream))  # type: ignore[arg-type]
@@ -179,7 +174,7 @@ class LawKind:
 
 @dataclass(frozen=True)
 class EachSide:
-    """Applies a perturbation of one image to both images of a frame. Depth is not changed."""
+    """Applies one perturbation to the left and the right image of a frame. Depth is not changed."""
 
     law: Law
 

@@ -19,9 +19,9 @@ from vslam.errors import DroppedFrameError, InputError, did_you_mean
 
 @dataclass(frozen=True)
 class Perturbation:
-    """A sequence of laws that are applied to each frame. A law is a perturbation of one kind.
+    """Perturbations that are applied to each frame, one after the other.
 
-    If there are no laws, the images stay unchanged.
+    A *law* is a perturbation of one kind. If there are no laws, the images stay unchanged.
 
     Attributes:
         name: canonical spelling, for example ``none`` or ``brightness:1.5,blur:0.5``.
@@ -33,9 +33,7 @@ class Perturbation:
     laws: tuple[PairLaw | SceneLaw, ...] = ()
 
     def bound_to(self, source: Source) -> Perturbation:
-        """Prepare the perturbation for one source.
-
-        This is necessary because some perturbations use the depth or the poses of the source.
+        """Prepare the perturbation for one source, because some laws use its depth or its poses.
 
         Raises:
             InputError: the source does not have the data that the perturbation needs.
@@ -51,9 +49,7 @@ class Perturbation:
     ) -> tuple[Image, Image | DepthImage | None]:
         """Perturb the images of a frame. This method is thread-safe.
 
-        Depth images stay unchanged, because depth sensors have their own light source. The left
-        image usually does not depend on the second image. Fog is an exception, because it uses the
-        depth that is computed from both images.
+        Depth images stay unchanged, because depth sensors have their own light source.
 
         Args:
             index: index of the frame.
@@ -111,10 +107,7 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
 
 
 def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Iterator[TimedFrame]:
-    """Yield the frames of a source. Their images are perturbed when they are read.
-
-    For the perturbation, time starts with 0 at the first frame.
-    """
+    """Yield the frames of a source. Their images are perturbed when they are read."""
     first = None
     laws = [law for law in perturbation.laws if isinstance(law, EachSide)]
     pair_needed = len(laws) < len(perturbation.laws)
@@ -162,9 +155,9 @@ def contact_sheet(
 ) -> Image:
     """Draw a grey image that shows a perturbation, with one row for each frame.
 
-    Each row shows the original left image and the perturbed images. It also shows the difference
-    between the original and the perturbed image, multiplied by a factor. For a stereo pair, the
-    image with the larger difference is used.
+    Each row shows the original left image, the perturbed images, and the amplified difference
+    between the original and the perturbed image. For a stereo pair, it is the difference of the
+    image that changes more.
 
     Args:
         indices: indices of the frames to show.
@@ -244,7 +237,6 @@ def _row(sequence: Source, perturbation: Perturbation, index: int, label: str) -
 
 
 def _titled(title: str, image: Image) -> Image:
-    """Add a title above an image, and a margin on the right and below."""
     import cv2
 
     height = round(_WIDTH * image.shape[0] / image.shape[1])

@@ -40,11 +40,10 @@ def ou_walk(
 ) -> Iterator[float]:
     """Yield the values of an Ornstein-Uhlenbeck process with a time constant of 2 s, without end.
 
-    Consecutive values are 10 ms apart. The discretisation is exact.
+    Consecutive values are 10 ms apart. The process begins in the stationary state.
 
     Args:
-        deviation: stationary standard deviation. The process begins in the stationary state.
-        rng: random generator, from which one normal number is drawn for each step.
+        deviation: stationary standard deviation.
         jumps: increasing times in seconds. At each of these times, the value is drawn anew, from a
             normal distribution with 1.5 times the deviation.
     """
@@ -63,10 +62,7 @@ def ou_walk(
 
 
 class Cached:
-    """Gives access by index to the numbers that an endless iterator yields.
-
-    The numbers are generated on demand. The class is thread-safe.
-    """
+    """Gives access by index to the numbers that an endless iterator yields. It is thread-safe."""
 
     def __init__(self, numbers: Iterator[float]) -> None:
         self._numbers = numbers
@@ -94,12 +90,7 @@ def jump_times(rng: np.random.Generator, per_second: float = _JUMPS_PER_S) -> It
 
 
 def _pointwise(curve: Callable[[int, float], NDArray[np.float64]]) -> Law:
-    """Make a perturbation that maps each grey value to a new grey value.
-
-    Args:
-        curve: function that takes the index and the time of a frame, and returns ``(256,)`` new
-            grey values.
-    """
+    """Make a perturbation from a function that returns ``(256,)`` new grey values for a frame."""
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
         import cv2
@@ -157,10 +148,7 @@ def _exposure(seconds: float, stream: RandomStream) -> Law:
 
 
 def _night(stops: float, stream: RandomStream) -> Law:
-    """Reduce the light at unchanged exposure and gain.
-
-    Photon noise (Poisson) and read noise are computed in electrons.
-    """
+    """Reduce the light at unchanged exposure and gain. Noise is computed in electrons."""
     electrons = FULL_WELL / 255.0
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
@@ -183,11 +171,7 @@ def _dark(level: float, stream: RandomStream) -> Law:
 
 
 def _blackout(period: float, stream: RandomStream) -> Law:
-    """Switch the light off once in every period, at a random time.
-
-    Two kinds of blackout alternate (``_BLACKOUTS``). After a short blackout, the light increases
-    slowly. After a long blackout, the light increases fast.
-    """
+    """Switch the light off once in every period, at a random time, as ``_BLACKOUTS`` says."""
 
     def curve(frame: int, t: float) -> NDArray[np.float64]:
         if t < _LIT_S:

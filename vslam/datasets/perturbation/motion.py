@@ -46,13 +46,10 @@ def neighbours(scene: Scene, frame: int) -> tuple[int, int]:
 
 
 def image_velocity(scene: Scene, frame: int) -> NDArray[np.float64]:
-    """Return the velocity with which the camera's rotation moves the image centre.
+    """Return the ``(2,)`` velocity (px/s) with which the rotation moves the image centre.
 
-    Returns ``(2,)`` pixels per second.
-
-    The velocity is computed from the true rotation if the rotation is known. Otherwise, it is
-    computed from the median optical flow to the next frame. The optical flow also contains the
-    effect of the forward motion.
+    The velocity is computed from the true rotation if it is known, otherwise from the median
+    optical flow to the next frame, which also contains the effect of the forward motion.
     """
     assert scene.times is not None
     assert scene.read is not None

@@ -23,21 +23,16 @@ _PROBE = (48, 64)  # rows and columns of the image on which a new law is tried
 
 
 def plugin_laws() -> dict[str, Callable[[float, tuple[int, int]], PlugInLaw]]:
-    """Return the laws (kinds of perturbation) that plug-ins in other Python packages define.
+    """Return the laws (kinds of perturbation) of plug-ins in other Python packages, by name.
 
-    Returns:
-        A function for each name of a law. The function takes a strength and a random stream
-        (`RandomStream`), and returns the perturbation.
+    Each law is a function that takes a strength, and a tuple of the user's seed and a number for
+    the law. The function returns the perturbation.
     """
     return {name: partial(_make, plugin) for name, plugin in find_plugins(PERTURBATIONS).items()}
 
 
 def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> PlugInLaw:
-    """Make a perturbation of a plug-in, and try it on a grey image.
-
-    Raises:
-        InputError: the plug-in is broken, or does not return a law.
-    """
+    """Make a perturbation of a plug-in, and try it on a grey image."""
     law = plugin.call(strength, stream)
     if not callable(law):
         raise InputError(
@@ -50,12 +45,7 @@ def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> PlugInLaw
 
 
 def _apply(plugin: PlugIn, law: PlugInLaw, frame: int, t: float, side: int, image: Image) -> Image:
-    """Apply a perturbation of a plug-in to an image.
-
-    Raises:
-        UnreadableImageError: the perturbation fails, or does not return an image of the same size.
-            The run then skips the frame.
-    """
+    """Apply a perturbation of a plug-in to an image. If it fails, the run skips the frame."""
     view = image.view()
     view.flags.writeable = False
     where = Path(f"frame {frame}")

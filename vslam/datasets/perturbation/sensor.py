@@ -84,10 +84,7 @@ def _drop(percent: float, stream: RandomStream) -> Law:
 
 
 def _outage(seconds: float, stream: RandomStream) -> Law:
-    """Drop all frames during one outage in every ten seconds.
-
-    The time of each outage is random, but no outage begins in the first second of the run.
-    """
+    """Drop all frames during one outage in every ten seconds. None begins in the first second."""
 
     def law(frame: int, t: float, side: int, image: Image) -> Image:
         block = int(t // 10.0)

@@ -22,9 +22,7 @@ from vslam.datasets.perturbation.kinds import (
 from vslam.datasets.perturbation.motion import neighbours, optical_flow
 
 
-def _of_right(change: Callable[[Pair, Image], Image]) -> PairLaw:
-    """Make a perturbation that changes only the right image."""
-
+def _changing_only_right(change: Callable[[Pair, Image], Image]) -> PairLaw:
     def law(pair: Pair) -> Pair:
         right = pair.right
         return pair if right is None else replace(pair, second=change(pair, right))
@@ -34,7 +32,7 @@ def _of_right(change: Callable[[Pair, Image], Image]) -> PairLaw:
 
 def _gain(stops: float, stream: RandomStream, scene: Scene) -> PairLaw:
     gain = 2.0**-stops
-    return _of_right(lambda pair, right: to_8_bits(gain * right.astype(np.float32)))
+    return _changing_only_right(lambda pair, right: to_8_bits(gain * right.astype(np.float32)))
 
 
 def _desync(ms: float, stream: RandomStream, scene: Scene) -> PairLaw:
@@ -53,7 +51,7 @@ def _desync(ms: float, stream: RandomStream, scene: Scene) -> PairLaw:
         share = 1e-3 * ms / float(times[other] - times[pair.index])
         return _moved(right, np.float32(share) * flow)
 
-    return _of_right(later)
+    return _changing_only_right(later)
 
 
 def _baseline(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
@@ -63,16 +61,11 @@ def _baseline(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
         shift = np.stack([-np.float32(percent / 100.0) * d, np.zeros_like(d)], axis=2)
         return _moved(right, shift)
 
-    return _of_right(longer)
+    return _changing_only_right(longer)
 
 
 def _moved(image: Image, shift: NDArray[np.float32]) -> Image:
-    """Shift each pixel of an image.
-
-    Args:
-        shift: ``(H, W, 2)`` displacements in pixels. The new value of a pixel is the value of the
-            image at the position of the pixel minus its displacement.
-    """
+    """Move the pixels of an image by the ``(H, W, 2)`` displacements ``shift`` in pixels."""
     import cv2
 
     y, x = np.mgrid[0 : image.shape[0], 0 : image.shape[1]].astype(np.float32)
@@ -101,16 +94,14 @@ def _turned(axis: int) -> Callable[[float, RandomStream, Scene], PairLaw]:
             turned = cv2.warpPerspective(right, H, size, borderMode=cv2.BORDER_REPLICATE)
             return np.asarray(turned, np.uint8)
 
-        return _of_right(turn)
+        return _changing_only_right(turn)
 
     return make
 
 
-def _black(
+def _black_in_some_seconds(
     side: Literal["left", "right"],
 ) -> Callable[[float, RandomStream, Scene], PairLaw]:
-    """Make a perturbation during which the images of one camera are black in some seconds."""
-
     def make(percent: float, stream: RandomStream, scene: Scene) -> PairLaw:
         def law(pair: Pair) -> Pair:
             dark = np.random.default_rng([*stream, int(pair.t)]).uniform() < percent / 100.0
@@ -158,9 +149,19 @@ KINDS = {
         _turned(0), "arc minutes", 5.0, 300.0, "the right camera is turned up", weakest=0.1
     ),
     "black_right": _fault(
-        _black("right"), "%", 30.0, 100.0, "seconds in which the right image is black", drawn=True
+        _black_in_some_seconds("right"),
+        "%",
+        30.0,
+        100.0,
+        "seconds in which the right image is black",
+        drawn=True,
     ),
     "black_left": _fault(
-        _black("left"), "%", 10.0, 100.0, "seconds in which the left image is black", drawn=True
+        _black_in_some_seconds("left"),
+        "%",
+        10.0,
+        100.0,
+        "seconds in which the left image is black",
+        drawn=True,
     ),
 }

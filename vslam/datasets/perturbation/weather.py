@@ -63,9 +63,8 @@ def drops_per_m3(mm_per_h: float) -> tuple[float, float]:
     """Compute the density of raindrops at a rainfall rate [Marshall and Palmer, J. Met. 1948].
 
     Returns:
-        Two numbers. The first one is the number of drops larger than 1 mm in a cubic metre of air.
-        The second one is the rate (1/mm) at which the number of drops decays exponentially with the
-        diameter.
+        The number of drops larger than 1 mm in a cubic metre of air, and the rate (1/mm) at which
+        the number of drops decays exponentially with the diameter.
     """
     rate = 4.1 * mm_per_h**-0.21
     return 8000.0 / rate * exp(-rate * _LEAST_MM), rate

@@ -38,7 +38,7 @@ def parse_drive(name: str) -> tuple[str, Variation]:
     """Split the name of a drive into the name of the route and the variation of its town.
 
     An example is ``05+change:0.5+moving:6+aliased+seed:1``. A name in `DRIVES` stands for a route
-    with a variation. Further parts may be added to it.
+    with a variation, to which more parts may be added.
 
     Raises:
         InputError: a part of the name is unknown.
@@ -84,9 +84,11 @@ def open_synthetic(
         name: name of the drive, for example ``05+change:0.5+seed:1`` (`parse_drive`).
         variation: variation of the town. If it is given, it is used instead of the variation in the
             name.
-        start, every, max_frames, monocular: which frames and cameras are read, see `open_kitti`.
-        threads, on_frame: number of threads of the renderer, and function that reports progress,
-            see `render_sequence`.
+        start, every, max_frames: read the frames ``start``, ``start + every`` and so on, at most
+            ``max_frames`` frames.
+        monocular: read only the left camera.
+        threads: number of threads of the renderer.
+        on_frame: called with the number of rendered frames and the number of all frames.
 
     Raises:
         InputError: the route or the variation is unknown, or `render_sequence` or `open_kitti`

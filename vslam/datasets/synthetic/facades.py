@@ -16,11 +16,9 @@ class FacadeStyle:
 
     Attributes:
         wall, frame, glass: grey levels of walls, window frames and panes.
-        brick: whether the walls are of brick instead of plaster.
-        storey: height of a storey, which is the vertical distance between windows, in metres.
+        storey: height of a storey in metres.
         pitch: horizontal distance between windows in metres.
         window: ``(width, height)`` of a window in metres.
-        shutters, balconies, shop, bands: whether the house has these.
     """
 
     wall: float
@@ -37,7 +35,7 @@ class FacadeStyle:
 
 
 def random_style(rng: Rng, *, town: bool) -> FacadeStyle:
-    """Draw a random style of a house. If ``town`` is set, the house may have a shop."""
+    """Draw a random style of a house. In a town, the house may have a shop."""
     brick = bool(rng.random() < 0.22)
     low, high = (70, 125) if brick else (185, 238) if rng.random() < 0.6 else (120, 180)
     return FacadeStyle(
@@ -64,10 +62,8 @@ def facade(
         rng: random generator for the parts of the building.
         lived: random generator for things that residents change, such as blinds, curtains and
             lights.
-        style: style of the house.
         size: width and height in metres.
-        front: whether the side is the front, which has a door and perhaps a shop. Other sides have
-            fewer windows.
+        front: whether the side is the front, which has a door and perhaps a shop.
 
     Returns:
         ``(H, W)`` albedo, 0 to 255, and ``(H, W)`` brightness of the windows at night, 0 to 1.
@@ -221,7 +217,6 @@ class _Painter:
         self.box(x + w + 0.3, height - 1.6, x + w + 0.55, height - 1.25, 50.0)
 
     def _goods(self, pane: Grey) -> None:
-        """Draw the goods in a shop window, and a reflection of the street."""
         height, width = pane.shape
         for _ in range(int(self.rng.integers(4, 12))):
             w, h = (max(2, int(n * self.rng.uniform(0.06, 0.3))) for n in (width, height))

@@ -23,16 +23,13 @@ _SAMPLED = 5  # number of frames whose checksums are compared in a quick check
 
 
 def frame_files(folder: Path, frame: int, depth: bool) -> list[Path]:
-    """Return the paths of a frame's left and right image, and of its depth image if ``depth``."""
+    """Return the files of a frame's left and right image, and of its depth image if ``depth``."""
     names = ("image_0", "image_1", *(("depth_0",) if depth else ()))
     return [folder / name / f"{frame:06d}.png" for name in names]
 
 
 def checksum(paths: Collection[Path]) -> str:
-    """Compute a checksum of several files as a hexadecimal number.
-
-    It is the first 64 bits of the SHA-256 digest of the concatenated files.
-    """
+    """Return the first 64 bits of the SHA-256 digest of the concatenated files, in hexadecimal."""
     digest = hashlib.sha256()
     for path in paths:
         digest.update(path.read_bytes())
@@ -51,7 +48,6 @@ def damaged_frames(folder: Path, manifest: dict[str, Any], *, thorough: bool) ->
     """Return the frames whose files differ from the manifest of a completely rendered sequence.
 
     Args:
-        folder: folder of the sequence.
         manifest: the ``checksums`` and ``sizes`` of the files of each frame.
         thorough: whether all checksums are compared. Otherwise, all sizes and a few checksums are
             compared.
@@ -94,7 +90,7 @@ def lock_of(folder: Path) -> AbstractContextManager[None]:
 
 
 def check_disk(cache: Path, frames: int, depth: bool) -> None:
-    """Check that the disk has enough space for a given number of frames.
+    """Check that the disk has enough space for a given number of stereo frames.
 
     Raises:
         InputError: there is not enough space.

@@ -67,8 +67,8 @@ def fisheye_rig(camera: Camera) -> FisheyeRig:
 def wide_camera(camera: Camera) -> Camera:
     """Return the rectified pinhole pair that is rendered for a fisheye pair.
 
-    The pinhole pair has the same focal length as the given pair. Its images are just large enough
-    to cover the view of the fisheye pair.
+    Its focal length is that of ``camera``. Its images are just large enough to cover the view of
+    the fisheye pair.
     """
     rig = fisheye_rig(camera)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
@@ -137,11 +137,7 @@ def render_fisheye(
 
 
 def _seen_at(model: CameraModel, R_own_rectified: Array, camera: Camera) -> NDArray[np.float32]:
-    """For each fisheye pixel, find the pinhole pixel with the same viewing direction.
-
-    Returns:
-        ``(H, W, 2)`` float32 coordinates in the image of the rectified pinhole camera, in pixels.
-    """
+    """Return the ``(H, W, 2)`` pinhole pixels with the viewing directions of the fisheye pixels."""
     u, v = np.meshgrid(np.arange(model.width), np.arange(model.height))
     own = unproject(model, np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
     at = camera.project(own @ R_own_rectified)[:, :2]

@@ -133,7 +133,6 @@ def make_ground(
 
 
 def _tile(x: float, z: float, terrain: Terrain, texture: int, fine: int) -> Surfaces:
-    """Make the surfaces of a tile: two triangles for each cell of the terrain."""
     cells = 2
     step = TILE / cells
     origin, s, t, uv = [], [], [], []

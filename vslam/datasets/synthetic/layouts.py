@@ -32,8 +32,8 @@ def render_rgbd(
 
     ``out/stereo`` contains the same drive in KITTI's format. The left image is used as the colour
     image. The depth is in centimetres, without a maximum range. It is 0 in the sky. The virtual
-    baseline in ``calibration.yaml`` is the baseline of the rendered stereo pair. Therefore, the
-    depths of distant points have the same uncertainty as with stereo.
+    baseline in ``calibration.yaml`` is the baseline of the rendered stereo pair, so that distant
+    points have the same uncertainty as with stereo.
 
     Args:
         route, variation, threads, on_frame: same meaning as for `render_sequence`.
@@ -89,16 +89,14 @@ def _depth_calibration(camera: Camera) -> str:
 
 
 def write_side_by_side(sequence: Source, path: Path) -> Path:
-    """Write a stereo sequence as a lossless video, and write its calibration to a file.
-
-    The left and right images are side by side. The codec is FFV1.
+    """Write a stereo sequence as a lossless video (FFV1), and write its calibration to a file.
 
     Args:
         sequence: a stereo sequence. Its mean frame rate becomes the frame rate of the video.
         path: path of the video, for example with the suffix ``.mkv``.
 
     Returns:
-        The path of the calibration file: the path of the video with the suffix ``.yaml``.
+        The calibration file: the path of the video with the suffix ``.yaml``.
 
     Raises:
         InputError: a file cannot be written.

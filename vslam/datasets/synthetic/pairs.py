@@ -94,7 +94,6 @@ def render_pairs(
         route: drive from which places are taken.
         variation: variation of the town. ``aliased`` makes different places more similar.
             ``change`` makes the images of one place differ as if they were taken on different days.
-        folder: output folder.
         count: number of pairs.
         moves: motion of the second camera.
         kinds: the kinds to render, in turn.
@@ -168,10 +167,7 @@ def _view(
 
 
 def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
-    """For each frame of a drive, find the frames at which the camera returned to the same place.
-
-    The camera must have a similar position and heading.
-    """
+    """For each frame, find the frames of other passes with a similar position and heading."""
     xz, ahead = T_wc[:, [0, 2], 3], T_wc[:, :3, 2]
     again = []
     for k, near in enumerate(cKDTree(xz).query_ball_point(xz, _TOGETHER)):
@@ -182,14 +178,7 @@ def _other_passes(T_wc: Float) -> list[NDArray[np.int64]]:
 
 
 def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
-    """Return which poses are at a different place than the pose ``T_wc``, in a different street.
-
-    Args:
-        others: ``(N, 4, 4)`` poses.
-
-    Returns:
-        ``(N,)`` bool.
-    """
+    """Return which of N poses are at a different place than ``T_wc`` and not in its street."""
     away = (others[:, :3, 3] - T_wc[:3, 3])[:, [0, 2]]
     ahead = T_wc[[0, 2], 2] / np.linalg.norm(T_wc[[0, 2], 2])
     aside = np.abs(away @ np.array([ahead[1], -ahead[0]]))
@@ -202,11 +191,11 @@ def _different(T_wc: Float, others: Float) -> NDArray[np.bool_]:
 def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDArray[np.int64]:
     """Find pairs of frames that look similar although they show different places.
 
-    There are several pairs for each place. The similarity of two places is the correlation of their
-    images, after the images were reduced in size, blurred and normalised.
+    The similarity of two places is the correlation of their images, after the images were reduced
+    in size, blurred and normalised.
 
     Returns:
-        ``(P, 2)`` frame indices of the P pairs.
+        ``(P, 2)`` frame indices. There are several pairs for each place.
     """
     chosen = np.unique(np.linspace(0, len(route.T_wc) - 1, _PLACES).astype(int))
     c = route.camera

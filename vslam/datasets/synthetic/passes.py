@@ -29,7 +29,7 @@ _CAR_REACH = np.array([1.1, 2.7])  # half the width and length of the largest ca
 
 
 class Passes:
-    """Computes the scene at each frame of a drive. The class is thread-safe."""
+    """Computes the surfaces and the light at each frame of a drive. The class is thread-safe."""
 
     def __init__(self, route: Route, town: Town, variation: Variation) -> None:
         self._route, self._town, self._variation = route, town, variation
@@ -40,14 +40,13 @@ class Passes:
         self._pools = lamp_pools(town.lamps)
 
     def at(self, frame: int) -> Moment:
-        """Return the scene of the town at a frame of the route."""
         number = int(np.searchsorted(self._starts, frame, side="right")) - 1
         light, night = self._light(frame, number)
-        standing = self._standing(frame)
+        standing = self._static_surfaces(frame)
         with self._lock:
             if number not in self._shadows:
                 begin, end = (*self._starts, len(self._route.T_wc))[number : number + 2]
-                occluders = self._standing((begin + end) // 2)
+                occluders = self._static_surfaces((begin + end) // 2)
                 self._shadows[number] = cast_shadows(occluders, self._town.atlas, light.sun)
                 while len(self._shadows) > _SHADOW_MAPS:
                     del self._shadows[next(iter(self._shadows))]
@@ -56,8 +55,7 @@ class Passes:
         surfaces = join([standing, *cars]) if cars else standing
         return Moment(surfaces, shadows, light, night, self._pools if night > 0 else NO_LAMPS)
 
-    def _standing(self, frame: int) -> Surfaces:
-        """Return the surfaces of the ground and of all things that do not move."""
+    def _static_surfaces(self, frame: int) -> Surfaces:
         surfaces, when = self._town.surfaces, self._town.when
         if not when.any():
             return surfaces
@@ -68,9 +66,8 @@ class Passes:
     def _light(self, frame: int, number: int) -> tuple[Light, float]:
         """Return the light at a frame of pass ``number``, and the darkness (0 by day, 1 at night).
 
-        A pass is a part of the drive in which no street is revisited. The sun does not move during
-        a pass. Between two passes, the sun moves while a cloud hides it. Night falls slowly during
-        the whole drive.
+        A pass is a part of the drive in which no street is revisited. The sun moves only between
+        two passes, while a cloud hides it. Night falls slowly during the whole drive.
         """
         seed, change = self._variation.seed, self._variation.change
         rng = np.random.default_rng([seed, 11])
@@ -98,10 +95,7 @@ class Passes:
         return light, night
 
     def _cars(self, frame: int) -> list[Surfaces]:
-        """Return the surfaces of the moving cars at a frame.
-
-        The first car drives ahead of the camera. The other cars approach on the other lane.
-        """
+        """The first moving car is ahead of the camera. The others approach on the other lane."""
         T_wc = self._route.T_wc
         here, cars = T_wc[frame], []
         for k, model in enumerate(self._town.moving):

@@ -97,9 +97,9 @@ def find_visible(surfaces, atlas, camera, light):
         slack = radius * (1.0 + max(abs(left), abs(right)))
         if xc < left * reach - slack or xc > right * reach + slack:
             continue
-        ax, ay, az = _turn(T_wc, ox, oy, oz)
-        bx, by, bz = _turn(T_wc, sx, sy, sz)
-        dx, dy, dz = _turn(T_wc, tx, ty, tz)
+        ax, ay, az = _in_camera_frame(T_wc, ox, oy, oz)
+        bx, by, bz = _in_camera_frame(T_wc, sx, sy, sz)
+        dx, dy, dz = _in_camera_frame(T_wc, tx, ty, tz)
         # [edge_s edge_t origin]^-1 by cross products.
         nx, ny, nz = by * dz - bz * dy, bz * dx - bx * dz, bx * dy - by * dx
         det = nx * ax + ny * ay + nz * az
@@ -172,8 +172,7 @@ def find_visible(surfaces, atlas, camera, light):
 
 
 @inline
-def _turn(T_wc, x, y, z):
-    """Rotate a world direction into the camera frame."""
+def _in_camera_frame(T_wc, x, y, z):
     return (
         T_wc[0, 0] * x + T_wc[1, 0] * y + T_wc[2, 0] * z,
         T_wc[0, 1] * x + T_wc[1, 1] * y + T_wc[2, 1] * z,
@@ -191,9 +190,9 @@ def _affine(row, at, x, y, z, fx, fy, cx, cy):
 
 @kernel
 def _box(corner, fx, fy, cx, cy):
-    """Return a quadrilateral's bounding box ``u0, u1, v0, v1`` in pixels.
+    """Return the bounding box ``u0, u1, v0, v1`` of a quadrilateral in pixels.
 
-    The quadrilateral is clipped at the near plane.
+    The quadrilateral has the ``(4, 3)`` corners ``corner`` and is clipped at the near plane.
     """
     u0, u1, v0, v1 = 1e9, -1e9, 1e9, -1e9
     for k in range(4):

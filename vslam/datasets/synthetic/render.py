@@ -72,7 +72,6 @@ class Light:
     headlight: float = 0.0
 
     def values(self) -> LightValues:
-        """Convert the light to the type that the kernels use."""
         sky = (self.direct, self.ambient, self.glow)
         air = (self.haze, self.visibility, self.exposure)
         return LightValues(*(float(x) for x in (*self.sun, *sky, *air, self.headlight)))
@@ -108,10 +107,7 @@ class Renderer:
         """Start the threads.
 
         Args:
-            camera: calibration of the rendered images.
-            atlas: textures of the town.
             sky: number of the sky's texture in the atlas, see `textures.sky`.
-            threads: number of threads.
         """
         self._camera = camera
         self._atlas = atlas

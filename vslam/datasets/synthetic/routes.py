@@ -38,8 +38,6 @@ class Route:
         camera: the stereo rig.
         T_wc: ``(N, 4, 4)`` float64 poses of the left camera in the world frame of the town. The
             heights of the terrain are measured from the plane y = 0 of this frame.
-        roads: the roads of the route.
-        terrain: the heights of the ground.
     """
 
     name: str
@@ -184,7 +182,6 @@ def route_of_poses(T_wc: Float, name: str, calibration: str = "00-02") -> Route:
 
     Args:
         T_wc: ``(N, 4, 4)`` float64 poses, with the y axis pointing down.
-        name: name of the route.
         calibration: one of `CALIBRATIONS`, which names the KITTI sequences whose camera is used.
 
     Raises:
@@ -286,10 +283,7 @@ def _headings(line: Float) -> Float:
 
 
 def _drive(path: Float, speed: float) -> Float:
-    """Compute the camera positions of a car that follows a ``(K, 2)`` path.
-
-    The car is slower in bends. Returns ``(N, 2)`` positions at 10 Hz.
-    """
+    """Return ``(N, 2)`` positions at 10 Hz of a car that follows a path and slows down in bends."""
     along = np.cumsum(np.r_[0, np.linalg.norm(np.diff(path, axis=0), axis=1)])
     keep = np.r_[True, np.diff(along) > 1e-9]
     along, path = along[keep], path[keep]
@@ -347,7 +341,7 @@ def _terrain(xz: Float, height: Callable[[Float], Float]) -> Terrain:
 
 
 def _heights_of(xz: Float, up: Float) -> Callable[[Float], Float]:
-    """Make a smooth height function. If a path passes a place twice, the heights are averaged.
+    """Make a smooth height function. The heights of a place that is passed twice are averaged.
 
     Args:
         xz: ``(N, 2)`` positions.

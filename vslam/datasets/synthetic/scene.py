@@ -1,7 +1,6 @@
 """Data types for the kernels of the renderer.
 
-The data types describe flat textured surfaces, their textures with mipmaps, the light and the
-camera.
+The types describe flat textured surfaces, textures with mipmaps, the light and the camera.
 """
 
 from __future__ import annotations
@@ -146,14 +145,11 @@ class AtlasBuilder:
         self._alpha: list[list[NDArray[np.uint8]] | None] = []
 
     def add(self, grey: NDArray[np.floating], alpha: NDArray[np.floating] | None = None) -> int:
-        """Add a texture to the atlas.
+        """Add a texture, and return its number in the atlas.
 
         Args:
             grey: ``(H, W)`` albedo, 0 to 255. H and W are powers of two. Row 0 is at v = 0.
             alpha: ``(H, W)`` alpha, 0 to 255; None if the texture is opaque.
-
-        Returns:
-            The number of the texture in the atlas.
         """
         if any(n & (n - 1) for n in grey.shape):
             raise ValueError(f"texture of {grey.shape} texels: sides must be powers of two")
@@ -162,7 +158,6 @@ class AtlasBuilder:
         return len(self._grey) - 1
 
     def build(self) -> Atlas:
-        """Join the textures to an atlas."""
         offset, texels = _flatten([*self._grey])
         alpha_offset, alpha = _flatten(self._alpha)
         log_size = [[int(n).bit_length() - 1 for n in p[0].shape[::-1]] for p in self._grey]

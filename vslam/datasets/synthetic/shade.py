@@ -90,9 +90,7 @@ def _bilinear(texels, at, log_w, log_h, level, u, v):
 
 @inline
 def _log2(bits):
-    """Return the integer part and the fraction of the binary logarithm of a float32.
-
-    The float32 is given by its bits.
+    """Return the integer part and the fraction of log2 of a float32, which is given by its bits.
 
     The fraction is interpolated linearly between powers of two.
     """
@@ -234,7 +232,9 @@ def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
         while start < width:
             first = seen[j * samples, start * samples]
             end = start
-            while end < width and _alike(seen, j * samples, end * samples, samples, first):
+            while end < width and _is_alone_in_pixel(
+                seen, j * samples, end * samples, samples, first
+            ):
                 end += 1
             if end > start:
                 number[0], weight[0], shift_u[0], shift_v[0] = first, room, 0.0, 0.0
@@ -248,9 +248,9 @@ def shade(visible, band, atlas, sky, light, shadows, pools, camera, view):
                 x, y = start + shift_u[k] / weight[k], v + shift_v[k] / weight[k]
                 run = _PixelRun(start, end, x, y, weight[k] / room)
                 if number[k] < 0:
-                    _sky_run(run, atlas, sky, light, camera, buffers)
+                    _add_sky_to_run(run, atlas, sky, light, camera, buffers)
                 else:
-                    _shade_run(
+                    _add_surface_to_run(
                         run, visible, number[k], atlas, light, shadows, pools, camera, buffers
                     )
             start = end
@@ -288,7 +288,7 @@ def _kinds(seen, row, column, samples, number, weight, shift_u, shift_v):
 
 
 @inline
-def _alike(seen, row, column, samples, first):
+def _is_alone_in_pixel(seen, row, column, samples, first):
     """Return whether the surface ``first`` is visible at all samples of a pixel."""
     alike = True
     for a in range(samples):
@@ -298,8 +298,7 @@ def _alike(seen, row, column, samples, first):
 
 
 @inline
-def _sky_run(run, atlas, sky, light, camera, buffers):
-    """Add the sky to the pixels of a run. `_shade_run` does the same for a surface."""
+def _add_sky_to_run(run, atlas, sky, light, camera, buffers):
     start, end, x0, y, weight = run.start, run.end, run.x, run.y, run.weight
     log_size, T_wc = atlas.log_size, camera.T_wc
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -319,11 +318,10 @@ def _sky_run(run, atlas, sky, light, camera, buffers):
 
 
 @inline
-def _shade_run(run, visible, number, atlas, light, shadows, pools, camera, buffers):
-    """Add a surface to the pixels of a run.
+def _add_surface_to_run(run, visible, number, atlas, light, shadows, pools, camera, buffers):
+    """Add the surface ``visible[number]`` to ``buffers.total`` and ``buffers.nearest``.
 
-    The surface is row ``number`` of ``visible``. The result is written to ``buffers.total`` and
-    ``buffers.nearest``. The other arguments have the same meaning as for `shade`.
+    The other arguments have the same meaning as for `shade`.
     """
     start, end, x0, y, weight = run.start, run.end, run.x, run.y, run.weight
     texels, offset, log_size, T_wc = atlas.texels, atlas.offset, atlas.log_size, camera.T_wc

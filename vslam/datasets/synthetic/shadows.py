@@ -17,7 +17,7 @@ _POOL_CELL, _POOL_REACH = 0.5, 16.0  # m
 
 
 class ShadowMap(NamedTuple):
-    """A shadow map, which stores the highest occluder on each sun ray.
+    """The highest occluder on each sun ray.
 
     A sun ray belongs to the cell where it meets the height 0.
 

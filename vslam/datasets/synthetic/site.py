@@ -19,8 +19,8 @@ from vslam.datasets.synthetic.textures import Rng
 class Palette:
     """The numbers of the town's textures in the atlas.
 
-    ``signs`` contains the front and the back of each sign. ``later_twigs`` are the sparser twigs of
-    trees whose appearance has changed.
+    ``signs`` contains a front and a back texture for each sign. ``later_twigs`` are the sparser
+    twigs of trees whose appearance has changed.
     """
 
     sky: int
@@ -73,7 +73,7 @@ def _sign(rng: Rng, atlas: AtlasBuilder) -> tuple[int, int]:
 
 
 def _kerb(rng: Rng) -> textures.Grey:
-    """Make the texture of kerb stones with a length of 1 m. The texture covers 4 m."""
+    """The kerb stones are 1 m long. The texture covers 4 m."""
     tone = np.repeat(rng.uniform(135, 175, 4), 128)[None, :]
     grey = tone * (1.0 + 0.09 * textures.noise(rng, 32, 512, 8.0, 3))
     grey[:, ::128] = grey[:, 1::128] = 60.0
@@ -118,16 +118,13 @@ class Variation:
 class Site:
     """A town under construction, with everything that is needed to add objects to it.
 
-    In this package, objects are called things.
+    Objects are called things in this package.
 
     Attributes:
-        route: the route along which the town is built.
-        variation: the variation of the town.
         roads: the roads of the route, with side streets.
         style: cross-section of the roads.
         plan: occupied ground.
-        atlas: textures.
-        palette: numbers of the textures.
+        palette: numbers of the textures in the atlas.
         rng: random generator for everything that may differ between variations.
         cameras: ``(N, 2)`` x and z of all possible camera positions.
         lamps: x and z of each street lamp.

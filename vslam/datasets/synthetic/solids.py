@@ -20,10 +20,7 @@ Vector = tuple[float, ...] | NDArray[np.float64]
 
 
 def turn(heading: float) -> NDArray[np.float64]:
-    """Return the ``(3, 3)`` rotation of the z axis to a heading.
-
-    The heading is in radians from +z towards +x.
-    """
+    """Return the ``(3, 3)`` rotation of the z axis to a heading in radians, from +z towards +x."""
     c, s = np.cos(heading), np.sin(heading)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
@@ -175,7 +172,6 @@ def _trunk(radius: float, height: float, bark: int, thing: int) -> Surfaces:
 
 
 def _branch(rng: Rng, start: Vector, end: Vector, radius: float, bark: int, thing: int) -> Surfaces:
-    """Make a branch of two crossed strips from ``start`` to ``end``."""
     way = np.asarray(end) - np.asarray(start)
     side = np.cross(way, rng.normal(0, 1, 3))
     side /= np.linalg.norm(side)
@@ -189,12 +185,7 @@ def _cards(
     rng: Rng, middle: NDArray[np.float64], size: NDArray[np.float64], twigs: list[int],
     thing: int, gain: float,
 ) -> Surfaces:  # fmt: skip
-    """Make square twigs with random rotations.
-
-    Args:
-        middle: ``(N, 3)`` positions.
-        size: ``(N,)`` lengths of the sides of the twigs in metres.
-    """
+    """Make N square twigs with random rotations. ``size`` has their side lengths in metres."""
     n = len(middle)
     heading, tilt, roll = rng.uniform((0, -0.6, 0), (2 * np.pi, 0.6, 6.3), (n, 3)).T[:, :, None]
     zero = np.zeros_like(heading)

@@ -74,7 +74,7 @@ def cache_folder() -> Path:
 
 
 def folder_name(variation: Variation) -> str:
-    """Return the name of the folder for all sequences whose towns have the same variation."""
+    """Return the name of the folder of all sequences whose towns have this variation."""
     name = f"v{VERSION}-seed{variation.seed}"
     name += "-aliased" if variation.aliased else ""
     name += f"-moving{variation.moving}" if variation.moving else ""
@@ -93,7 +93,6 @@ def list_stored(cache: Path) -> list[Stored]:
 
 
 def _folder_size(folder: Path) -> int:
-    """Return the total size of the files in a folder in bytes."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
@@ -103,11 +102,7 @@ def place_folder(cache: Path) -> Path:
 
 
 def clean(cache: Path, name: str | None = None) -> int:
-    """Remove the whole cache, or all variations of the route ``name``.
-
-    Returns:
-        The number of freed bytes.
-    """
+    """Remove the whole cache, or all variations of the route ``name``. Return the freed bytes."""
     freed = 0
     for places in cache.glob("v*-places") if name is None else []:
         freed += _folder_size(places)
@@ -131,12 +126,11 @@ def render_sequence(
     threads: int = 2,
     on_frame: OnFrame | None = None,
 ) -> Path:
-    """Render the missing frames of a route, and return the folder of the sequence.
+    """Render the missing frames of a route in KITTI's format. Return the folder of the data set.
 
-    Damaged frames are rendered again, and a warning is logged. The folder has KITTI's format.
+    Damaged frames are rendered again, and a warning is logged.
 
     Args:
-        route: route to render.
         variation: variation of the town.
         cache: folder of the rendered sequences (`cache_folder`).
         depth: whether to write ``depth_0``, too. It contains the depth of the left camera in
@@ -194,7 +188,6 @@ def render_sequence(
 
 
 def _matching_record(folder: Path, wanted: dict[str, Any], camera: Camera) -> dict[str, Any] | None:
-    """Read the manifest of a folder. None if it does not describe the wanted sequence."""
     found = _read_record(folder)
     if found is None or any(found.get(key) != value for key, value in wanted.items()):
         return None
@@ -224,7 +217,7 @@ def render_frames(
     """Render frames of a route into the folder of a sequence.
 
     Args:
-        depth, threads: whether depth is written, and how many frames are rendered in parallel.
+        threads: number of frames that are rendered in parallel.
         on_frame: called with the number of finished frames and ``total``.
         total: number of frames of the sequence. Frames that are not rendered count as finished.
         monocular: render only the left images.
@@ -280,7 +273,7 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
 
 
 def calibration_text(camera: Camera) -> str:
-    """Return the text of KITTI's ``calib.txt``. The colour cameras equal the grey cameras."""
+    """Return KITTI's ``calib.txt``. Colour and grey cameras have the same calibration."""
     lines = []
     for side in range(4):
         shift = -camera.bf if side % 2 else 0.0

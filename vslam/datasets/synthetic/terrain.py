@@ -33,15 +33,9 @@ class Terrain:
     up: Float
 
     def height(self, xz: Float) -> Float:
-        """Return the height of the ground above y = 0.
+        """Return the ``(N,)`` heights in metres above y = 0 of the ground at ``(N, 2)`` positions.
 
         For a position outside of the grid, the height of the nearest point of the grid is returned.
-
-        Args:
-            xz: ``(N, 2)`` positions.
-
-        Returns:
-            ``(N,)`` metres.
         """
         at = (np.asarray(xz, np.float64) - self.corner) / self.cell
         limit = np.array(self.up.shape[::-1]) - 1.001
@@ -83,8 +77,8 @@ def roads_of(lines: list[Float], *, same_road: float = 3.0) -> Roads:
 
     Args:
         lines: ``(K, 2)`` middle lines of the roads in metres, in driving order.
-        same_road: largest distance in metres at which a later parallel stretch counts as the same
-            road as an earlier one.
+        same_road: a parallel stretch that is at most this many metres away from an earlier stretch
+            is left out.
     """
     kept: list[NDArray[np.float64]] = []
     offset = 0.0
@@ -135,12 +129,7 @@ class Plan:
     """A raster map of the town: occupied ground, lines of sight and distances from roads."""
 
     def __init__(self, roads: Roads, cameras: Float) -> None:
-        """Make a plan without objects.
-
-        Args:
-            roads: the roads of the town.
-            cameras: ``(N, 2)`` float64 x and z of all possible camera positions.
-        """
+        """Make a plan without objects. ``cameras`` are all ``(N, 2)`` camera positions (x, z)."""
         self._low = roads.xz.min(axis=0) - _BORDER
         columns, rows = np.ceil((roads.xz.max(axis=0) + _BORDER - self._low) / _CELL).astype(int)
         self._taken = np.zeros((rows, columns), np.uint8)
@@ -182,7 +171,7 @@ class Plan:
         if (
             (self._taken[window][inside] > 0).any()
             or (self._road[window][inside] < road).any()
-            or self._near_camera(corners)
+            or self._is_near_camera(corners)
         ):
             return False
         self._taken[window][inside] = 1
@@ -190,8 +179,7 @@ class Plan:
             self._tall[window][inside] = 1
         return True
 
-    def _near_camera(self, corners: Float) -> bool:
-        """Return whether a camera position is nearer than `CLEARANCE` to a convex polygon."""
+    def _is_near_camera(self, corners: Float) -> bool:
         middle = corners.mean(axis=0)
         reach = np.linalg.norm(corners - middle, axis=1).max() + CLEARANCE
         polygon = corners.astype(np.float32)[:, None]
@@ -201,10 +189,7 @@ class Plan:
         )
 
     def road_distance(self, xz: Float) -> NDArray[np.float32]:
-        """Return the distance of ``(N, 2)`` positions from the middle of the nearest road.
-
-        Returns ``(N,)`` metres.
-        """
+        """Return the ``(N,)`` distances in metres from the middle of the nearest road."""
         c, r = self._cell(xz).T
         return self._road[r, c]
 

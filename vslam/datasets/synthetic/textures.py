@@ -20,14 +20,11 @@ _LETTERS = np.array(list("ABCDEFGHIKLMNOPRSTUVWZ0123456789"))
 
 
 def noise(rng: Rng, height: int, width: int, cell: float, octaves: int = 4) -> Grey:
-    """Make tileable band-limited noise with zero mean and unit variance.
+    """Make ``(height, width)`` float32 tileable noise with zero mean and unit variance.
 
     Args:
         cell: cell size of the coarsest grid in texels. Each octave has half the cell size and 0.7
             of the contrast of the octave before.
-
-    Returns:
-        ``(height, width)`` float32.
     """
     total = np.zeros((1, 1), np.float32)
     for octave in range(octaves):
@@ -55,7 +52,6 @@ def detail(rng: Rng, contrast: float, cell: float = 8.0, size: int = 256) -> Gre
 
 
 def letters(rng: Rng, low: int = 3, high: int = 9) -> str:
-    """Return a random word."""
     return "".join(rng.choice(_LETTERS, int(rng.integers(low, high))))
 
 
@@ -216,7 +212,8 @@ def poster(rng: Rng, size: int = 128) -> Grey:
 def sky(rng: Rng) -> Grey:
     """Make a panorama of clouds over distant trees.
 
-    u corresponds to the heading. v decreases with the elevation.
+    The horizontal axis is the heading. The vertical axis is the tangent of the elevation, from
+    `SKY_RISE` at the top to minus `SKY_FALL`.
     """
     height, width = 512, 2048
     rise = np.linspace(SKY_RISE, -SKY_FALL, height, dtype=np.float32)[:, None]

@@ -67,8 +67,6 @@ def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0
     """Build the town of a route.
 
     Args:
-        route: route along which the town is built.
-        variation: variation of the town.
         aside: lateral shifts of the camera in metres, to the right. The space at these positions is
             kept free.
     """
@@ -112,7 +110,6 @@ def build_town(route: Route, variation: Variation, aside: tuple[float, ...] = (0
 
 
 def _with_side_streets(roads: Roads, seed: int) -> Roads:
-    """Add short side streets to the roads of the route."""
     rng = np.random.default_rng([seed, 2])
     tree, stubs = cKDTree(roads.xz), []
     at = int(rng.integers(120, 240))
@@ -137,7 +134,7 @@ def _with_side_streets(roads: Roads, seed: int) -> Roads:
     )
 
 
-def _house(site: Site, xz: Float, heading: float, size: tuple[float, float, float]) -> None:
+def _build_house(site: Site, xz: Float, heading: float, size: tuple[float, float, float]) -> None:
     """Build a house whose front is at ``xz`` and faces in the direction opposite to ``heading``."""
     seed, number = site.variation.seed, site.next_thing
     key = number % ALIASES if site.variation.aliased else number
@@ -165,20 +162,19 @@ def _house(site: Site, xz: Float, heading: float, size: tuple[float, float, floa
         site.stand(house, xz, heading, when)
 
 
-def _try_house(
+def _build_house_if_free(
     site: Site, front: Float, heading: float, size: tuple[float, float, float], clear: float
 ) -> bool:
-    """Build a house if its ground is free. Return whether the house was built."""
     ahead = np.array([np.sin(heading), np.cos(heading)])
     middle = front + 0.5 * size[2] * ahead
     if not site.plan.claim(rectangle(middle, heading, size[0], size[2]), road=clear, tall=True):
         return False
-    _house(site, front, heading, size)
+    _build_house(site, front, heading, size)
     return True
 
 
-def _size(site: Site, rng: Rng) -> tuple[float, float, float]:
-    """Draw width, height and depth of a house in metres."""
+def _random_size(site: Site, rng: Rng) -> tuple[float, float, float]:
+    """Draw the width, height and depth of a house in metres."""
     if site.variation.aliased:
         rng = np.random.default_rng([site.variation.seed, 6, site.next_thing % ALIASES])
     if site.route.land == "town":
@@ -189,12 +185,11 @@ def _size(site: Site, rng: Rng) -> tuple[float, float, float]:
 
 
 def line_with_houses(site: Site) -> None:
-    """Build houses along both sides of every road."""
     roads, rng, town = site.roads, site.rng, site.route.land == "town"
     for side in (-1.0, 1.0):
         at, setback = 0, site.style.walk + (2.0 if town else 6.0)
         while at < len(roads.xz) - 20:
-            size = _size(site, rng)
+            size = _random_size(site, rng)
             middle = min(at + int(2 * size[0]), len(roads.xz) - 1)
             if rng.random() < 0.45:
                 low, high = (0.3, 4.0) if town else (4.0, 11.0)
@@ -202,7 +197,7 @@ def line_with_houses(site: Site) -> None:
             out = roads.right[middle] * side
             front = roads.xz[middle] + setback * out
             heading = float(np.arctan2(out[0], out[1])) + float(rng.normal(0, 0.015))
-            if _try_house(site, front, heading, size, site.style.walk + 0.2):
+            if _build_house_if_free(site, front, heading, size, site.style.walk + 0.2):
                 gap = 0.0
                 if not (town and rng.random() < 0.45):
                     gap = float(rng.uniform(2.5, 9.0) if town else rng.uniform(5.0, 16.0))
@@ -227,9 +222,9 @@ def close_sight_lines(site: Site) -> None:
                 continue
             distance = site.plan.road_distance(line)
             for k in range(24, len(line), 3):
-                size = _size(site, rng)
+                size = _random_size(site, rng)
                 if distance[k] <= site.style.walk + 1.0:
                     continue
                 facing = heading + float(angle) + float(rng.normal(0, 0.25))
-                if _try_house(site, line[k], facing, size, site.style.walk + 0.5):
+                if _build_house_if_free(site, line[k], facing, size, site.style.walk + 0.5):
                     break

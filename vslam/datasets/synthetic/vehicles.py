@@ -105,12 +105,9 @@ def _trapezium(
 
 
 def _sides(size: tuple[float, float, float], texture: int, thing: int) -> list[Surfaces]:
-    """Make both sides of a car.
+    """Make both sides of a car of ``(length, width, height)`` metres.
 
     Each side has a lower part that tapers at both ends, and a cabin that leans inwards.
-
-    Args:
-        size: length, width and height in metres.
     """
     length, width, height = size
     parts = []

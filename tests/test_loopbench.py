@@ -141,6 +141,8 @@ def test_a_drive_asks_for_what_lies_long_before(tmp_path):
     assert asked.relation[9, 0] == DIFFERENT
     assert found.query_set(Condition("change", 1.0), 0) is None
     assert asked.in_order
+    with pytest.raises(InputError, match="00 has only 50 images; give more than 50"):
+        open_set(f"kitti:{tmp_path}[last=49]", tmp_path, threads=1, progress_bar=no_bar)
 
 
 def test_of_pairs_the_second_images_ask(tmp_path):

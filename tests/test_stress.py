@@ -405,9 +405,14 @@ def test_frames_without_a_pose_are_lost(tmp_path):
 rows = [f"{t} {0.1 * (i % 3)} 0 {i} 0 0 0 1" for i, t in enumerate(times) if i not in (4, 5)]
 (out / "trajectory.txt").write_text("\\n".join(rows))
 """
-    report = run_script(make_kitti(tmp_path), tum)
+    states = """
+(out / "states.txt").write_text(" ".join(["OK"] * 8 + ["LOST"] * 4))
+"""
+    root = make_kitti(tmp_path)
+    report = run_script(root, tum)
     assert report.lost_frames == 2
     assert 0.0 < report.ate_rmse_m < 0.1  # unknown poses are interpolated
+    assert run_script(root, tum + states).lost_frames == 6
 
 
 def test_states_and_causal_poses_of_another_system_count(tmp_path):

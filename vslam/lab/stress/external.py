@@ -182,7 +182,7 @@ def _outcome(
             raise InputError(
                 f"{settings.detector}: states.txt has {len(states)} states for {len(kept)} frames."
             )
-        lost[kept] = np.array(states) != "OK"
+        lost[kept] |= np.array(states) != "OK"
     dropped = np.ones(len(times), bool)
     dropped[kept] = False
     trajectory = final.bridged(times)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import re
+import runpy
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -293,6 +295,37 @@ def two_conditions() -> list[RunEntry]:
             ate = 1.5 if finds else 2.0 + 0.1 * int(name)
             runs += [entry(system, name, ate, k, **loops(finds, not finds, lost=k)) for k in (0, 1)]
     return runs
+
+
+@pytest.fixture
+def switched_off(tmp_path: Path, monkeypatch):
+    """Return a function that runs switch_off.py on given runs and returns its table."""
+
+    def table(runs: list[RunEntry], *words: str) -> list[dict[str, str]]:
+        def bench(command: list[str]) -> SimpleNamespace:
+            out = Path(command[command.index("--out") + 1])
+            out.mkdir(parents=True)
+            report = summarize(Found(runs, [])).model_dump_json()
+            (out / "report.json").write_text(report)
+            return SimpleNamespace(returncode=0)
+
+        script = Path(__file__).parents[1] / "tools/experiments/ablation/switch_off.py"
+        monkeypatch.setattr("subprocess.run", bench)
+        arguments = ["--source", "", "--out", str(tmp_path / "out"), *words]
+        monkeypatch.setattr(sys, "argv", [str(script), *arguments])
+        runpy.run_path(str(script), run_name="__main__")
+        return list(csv.DictReader((tmp_path / "out" / "ablation.csv").open()))
+
+    return table
+
+
+def test_a_part_is_switched_off_together_with_its_reference(switched_off):
+    rows = switched_off([entry("both", "00", 1.0, perturb="none", **loops(1, 0))],
+                        "--only", "alignment")  # fmt: skip
+    assert [(row["without"], row["compared_with"]) for row in rows] == [
+        ("nothing", "nothing"), ("tracking by patches", "nothing"),
+        ("alignment of matches", "tracking by patches"),
+    ]  # fmt: skip
 
 
 def test_a_row_for_each_sequence_and_condition_and_who_wins_over_all(two_conditions):

@@ -145,7 +145,9 @@ def main() -> None:
     arguments = ["--perturb", options.perturb, "--jobs", options.jobs]
     runs: dict[str, dict[Drive, Measures]] = {}
     rows = []
-    chosen = [one for one in VARIANTS if one.piece == "nothing" or options.only in one.piece]
+    named = [one for one in VARIANTS if options.only in one.piece]
+    references = {"nothing", *(one.reference for one in named)}
+    chosen = [one for one in VARIANTS if one in named or one.piece in references]
     for variant in chosen:
         runs[variant.piece] = {}
         for k, source in enumerate(options.source):

@@ -328,6 +328,14 @@ def test_a_part_is_switched_off_together_with_its_reference(switched_off):
     ]  # fmt: skip
 
 
+def test_an_ablation_has_a_row_for_each_perturbation_of_the_images(switched_off):
+    perturbs = ("none", "moving:6", "noise:1", "aliased,noise:1", "dark:4,noise:1")
+    runs = [entry("both", "00", 1.0, perturb=one, **loops(1, 0)) for one in perturbs]
+    rows = switched_off(runs, "--only", "triangulation", "--perturb", "none,noise,dark:4+noise")
+    found = [(r["perturb"], r["drives"]) for r in rows if r["without"] == "triangulation"]
+    assert found == [("none", "2"), ("noise:1", "2"), ("dark:4+noise:1", "1")]
+
+
 def test_a_row_for_each_sequence_and_condition_and_who_wins_over_all(two_conditions):
     (section,) = versus(summarize(Found(two_conditions, [])))
     table, points = section.parts

@@ -529,10 +529,13 @@ def test_options_that_change_results_make_systems_too(run_folder: Path, tmp_path
         copy_run(run_folder, tmp_path / name, detector="capsule", sensor="mono", **options)
     copy_run(run_folder, tmp_path / "d", detector="capsule", sensor="mono", threads=7)
     copy_run(run_folder, tmp_path / "e", detector="capsule", sensor="mono", mask="hood.png")
+    calib = ["left.yaml", "right.yaml"]
+    copy_run(run_folder, tmp_path / "f", detector="capsule", sensor="mono", calib=calib)
     rows = summarize(collect([tmp_path], [])).rows
     assert {row.system: row.runs for row in rows} == {
         "capsule, mono": 2, "capsule (weights=mine.onnx), mono": 1,
         "capsule (realtime=True), mono": 1, "capsule (mask=hood.png), mono": 1,
+        "capsule (calib=left.yaml right.yaml), mono": 1,
     }  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from vslam.cli import main as cli
 from vslam.config import Config
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
+from vslam.lab.overview import figures
 from vslam.lab.overview.collect import Found, collect, read_aligned
 from vslam.lab.overview.render import overview_page, write_overview
 from vslam.lab.overview.schema import ALL, MEASURES, Drive, OverviewJson, RunEntry, Spread
@@ -699,6 +700,20 @@ FIGURES = {
     *(f"path-kitti-{name}-{law}" for name in ("00", "05")
       for law in ("none", "brightness-0-5", "brightness-1")),
 }  # fmt: skip
+
+
+def test_runs_without_an_error_do_not_shift_the_median_that_is_drawn(monkeypatch):
+    ates = (3.0, None, 1.0, 2.0, None)
+    found = Found([entry("bow", "00", ate, seed) for seed, ate in enumerate(ates)], [])
+    asked = []
+
+    def no_trajectory(found: Found, run: RunEntry):
+        asked.append(run.measures["ate_rmse_m"])
+        raise InputError("no trajectory")
+
+    monkeypatch.setattr(figures, "read_aligned", no_trajectory)
+    figures.draw_overview(summarize(found), found)
+    assert asked == [2.0]
 
 
 def test_html_has_every_figure_and_loads_nothing(written):

@@ -324,7 +324,7 @@ for (const path of ["/", "/run/0", "/run/1"])
 
 
 @pytest.mark.slow
-def test_a_script_in_a_report_reads_no_other_one(server, run: Path, tmp_path: Path):
+def test_a_script_in_a_report_reads_no_other_one(server, tmp_path: Path):
     (tmp_path / "<b>second" / "report.html").write_text(SPY)
     links = re.findall(r'href="(/run/\d)"[^>]*>&lt;b&gt;second', ask(server, "/")[1])
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--dump-dom",

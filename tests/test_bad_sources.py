@@ -248,7 +248,7 @@ def test_folders_of_images(folder, corridor, tmp_path):
     refused("no images in this folder", "images", tmp_path / "left", options)
 
 
-def test_cameras(folder, tmp_path, monkeypatch, side_by_side):
+def test_cameras(tmp_path, monkeypatch, side_by_side):
     refused("camera 77: no such device", "camera", "77", side_by_side)
     url = "http://me:word@127.0.0.1:9/a"
     refused("camera 127.0.0.1/a: cannot be opened", "camera", url, side_by_side)

@@ -25,13 +25,16 @@ def made_run(speed, report, held=(), memory_mb=300.0):
     return speed.Run(process, report, 0, 0, Path("trajectory.txt"))
 
 
-def test_a_case_is_a_title_and_a_place(speed, kitti_tree):
+def test_a_case_is_a_title_and_a_place(speed, kitti_tree, tmp_path):
     case = speed.parse_case(f"a town={kitti_tree}:00:28")
     assert case == ("a town", kitti_tree, "00", 28)
     assert speed.rate(case) == pytest.approx(10.0)
     for wrong in ("no place", f"t={kitti_tree}:00", f"t={kitti_tree}:00:all", "t=/nowhere:00:5"):
         with pytest.raises(argparse.ArgumentTypeError):
             speed.parse_case(wrong)
+    (tmp_path / "sequences" / "00" / "image_0").mkdir(parents=True)
+    with pytest.raises(argparse.ArgumentTypeError, match="image_1: no such folder; give"):
+        speed.parse_case(f"t={tmp_path}:00:5")
 
 
 @pytest.mark.slow

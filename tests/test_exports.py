@@ -478,7 +478,7 @@ def test_ply_needs_no_image_without_colours(corridor_run, tmp_path):
     assert read_ply(tmp_path / "grey.ply")[1] is None
 
 
-def test_map_info(corridor_run, tmp_path):
+def test_map_info(corridor_run):
     lines = [" ".join(line.split()) for line in vslam("map", "info", corridor_run).splitlines()]
     out = "\n".join([*lines, ""])
     finished = read_run(corridor_run)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import re
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -371,3 +372,12 @@ def test_refusals(kitti_tree, mapped, tmp_path):
     assert "there is no folder" in refusal(*run, "--save-map", tmp_path / "gone" / "m.npz")
     assert "is a folder" in refusal(*run, "--save-map", tmp_path)
     assert not list((tmp_path / "out").glob("*/report.json"))
+
+
+def test_the_experiment_by_night_needs_images_beyond_its_map(kitti_tree, tmp_path, monkeypatch):
+    script = Path(__file__).parents[1] / "tools/experiments/light/day_night.py"
+    words = ["kitti", "00=6", "--data", kitti_tree, "--max-frames", "6", "--detectors", "bow"]
+    words = [script, *words, "--out", tmp_path / "table.csv"]
+    monkeypatch.setattr("sys.argv", list(map(str, words)))
+    with pytest.raises(SystemExit, match="00: no image is left to localise; give a smaller"):
+        runpy.run_path(str(script), run_name="__main__")

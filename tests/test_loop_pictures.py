@@ -135,9 +135,7 @@ def test_there_is_no_picture_without_both_images(closed_map: Map) -> None:
     assert not of_another_drive.pictures
 
 
-def test_a_long_run_keeps_new_images_and_some_of_the_old(
-    closed_map: Map, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_run_keeps_new_images_and_some_of_the_old(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vslam.run.moments, "_MOST_LOOP_IMAGES", 8)
     pictures = told(list(range(41)))
     assert len(pictures._jpegs) <= 8

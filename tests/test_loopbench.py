@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import gc
 import json
 import re
 import runpy
 import sys
+import weakref
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,7 +24,7 @@ from vslam.errors import InputError
 from vslam.lab.loopbench import report as reporting
 from vslam.lab.loopbench.conditions import Condition, apply, clipped, parse_conditions, turned
 from vslam.lab.loopbench.cost import cost
-from vslam.lab.loopbench.detectors import BowScorer, DetectorSet, describe
+from vslam.lab.loopbench.detectors import BowScorer, DetectorSet, LocalDescriptorCache, describe
 from vslam.lab.loopbench.measure import (
     LENGTH,
     epipolar_inliers,
@@ -141,6 +143,8 @@ def test_a_drive_asks_for_what_lies_long_before(tmp_path):
     assert asked.relation[9, 0] == DIFFERENT
     assert found.query_set(Condition("change", 1.0), 0) is None
     assert asked.in_order
+    with pytest.raises(InputError, match="00 has only 50 images; give more than 50"):
+        open_set(f"kitti:{tmp_path}[last=49]", tmp_path, threads=1, progress_bar=no_bar)
 
 
 def test_of_pairs_the_second_images_ask(tmp_path):
@@ -268,6 +272,16 @@ def test_what_is_made_of_images_asked_for_is_kept_while_they_are_asked_for(vocab
     detectors.gallery(galleries[1])
     assert len(told.stored) == 5
     assert detectors.gallery(galleries[0][::-1])[0] is not views
+
+
+def test_local_descriptors_are_kept_as_long_as_their_image(vocabulary):
+    local, images = LocalDescriptorCache(), describe([texture(0), texture(1)], vocabulary, 1)
+    kept, freed = (weakref.ref(local.of(image).coarse) for image in images)
+    assert local.of(images[0]).coarse is kept()
+    images.pop()
+    gc.collect()
+    assert local.of(images[0]).coarse is kept()
+    assert freed() is None
 
 
 def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):

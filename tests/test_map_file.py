@@ -170,7 +170,7 @@ def test_loops_images_drives_and_world_come_back(slam, tmp_path):
     assert np.array_equal(found.truth_alignment.S_truth_world, world.S_truth_world)
 
 
-def test_what_the_detector_knew_comes_back(slam, file, ring):
+def test_what_the_detector_knew_comes_back(file, ring):
     """The candidates have the same scores, and the words need not be looked up again."""
     again = create_detector("bow", CONFIG)
     stored = load_map(file)

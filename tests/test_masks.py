@@ -202,7 +202,7 @@ def opened(folder, mask, calib="left.yaml", **more):
     )  # fmt: skip
 
 
-def test_a_mask_is_rectified_like_the_image(corridor, folder, mask, tmp_path):
+def test_a_mask_is_rectified_like_the_image(folder, mask, tmp_path):
     path = write_mask(tmp_path / "mask.png", mask)
     frame = opened(folder, path).stored[0]
     assert (frame.mask() == mask).all()

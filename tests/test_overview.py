@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import re
+import runpy
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from vslam.cli import main as cli
 from vslam.config import Config
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
+from vslam.lab.overview import figures
 from vslam.lab.overview.collect import Found, collect, read_aligned
 from vslam.lab.overview.render import overview_page, write_overview
 from vslam.lab.overview.schema import ALL, MEASURES, Drive, OverviewJson, RunEntry, Spread
@@ -295,6 +298,45 @@ def two_conditions() -> list[RunEntry]:
     return runs
 
 
+@pytest.fixture
+def switched_off(tmp_path: Path, monkeypatch):
+    """Return a function that runs switch_off.py on given runs and returns its table."""
+
+    def table(runs: list[RunEntry], *words: str) -> list[dict[str, str]]:
+        def bench(command: list[str]) -> SimpleNamespace:
+            out = Path(command[command.index("--out") + 1])
+            out.mkdir(parents=True)
+            report = summarize(Found(runs, [])).model_dump_json()
+            (out / "report.json").write_text(report)
+            return SimpleNamespace(returncode=0)
+
+        script = Path(__file__).parents[1] / "tools/experiments/ablation/switch_off.py"
+        monkeypatch.setattr("subprocess.run", bench)
+        arguments = ["--source", "", "--out", str(tmp_path / "out"), *words]
+        monkeypatch.setattr(sys, "argv", [str(script), *arguments])
+        runpy.run_path(str(script), run_name="__main__")
+        return list(csv.DictReader((tmp_path / "out" / "ablation.csv").open()))
+
+    return table
+
+
+def test_a_part_is_switched_off_together_with_its_reference(switched_off):
+    rows = switched_off([entry("both", "00", 1.0, perturb="none", **loops(1, 0))],
+                        "--only", "alignment")  # fmt: skip
+    assert [(row["without"], row["compared_with"]) for row in rows] == [
+        ("nothing", "nothing"), ("tracking by patches", "nothing"),
+        ("alignment of matches", "tracking by patches"),
+    ]  # fmt: skip
+
+
+def test_an_ablation_has_a_row_for_each_perturbation_of_the_images(switched_off):
+    perturbs = ("none", "moving:6", "noise:1", "aliased,noise:1", "dark:4,noise:1")
+    runs = [entry("both", "00", 1.0, perturb=one, **loops(1, 0)) for one in perturbs]
+    rows = switched_off(runs, "--only", "triangulation", "--perturb", "none,noise,dark:4+noise")
+    found = [(r["perturb"], r["drives"]) for r in rows if r["without"] == "triangulation"]
+    assert found == [("none", "2"), ("noise:1", "2"), ("dark:4+noise:1", "1")]
+
+
 def test_a_row_for_each_sequence_and_condition_and_who_wins_over_all(two_conditions):
     (section,) = versus(summarize(Found(two_conditions, [])))
     table, points = section.parts
@@ -488,10 +530,13 @@ def test_options_that_change_results_make_systems_too(run_folder: Path, tmp_path
         copy_run(run_folder, tmp_path / name, detector="capsule", sensor="mono", **options)
     copy_run(run_folder, tmp_path / "d", detector="capsule", sensor="mono", threads=7)
     copy_run(run_folder, tmp_path / "e", detector="capsule", sensor="mono", mask="hood.png")
+    calib = ["left.yaml", "right.yaml"]
+    copy_run(run_folder, tmp_path / "f", detector="capsule", sensor="mono", calib=calib)
     rows = summarize(collect([tmp_path], [])).rows
     assert {row.system: row.runs for row in rows} == {
         "capsule, mono": 2, "capsule (weights=mine.onnx), mono": 1,
         "capsule (realtime=True), mono": 1, "capsule (mask=hood.png), mono": 1,
+        "capsule (calib=left.yaml right.yaml), mono": 1,
     }  # fmt: skip
 
 
@@ -655,6 +700,20 @@ FIGURES = {
     *(f"path-kitti-{name}-{law}" for name in ("00", "05")
       for law in ("none", "brightness-0-5", "brightness-1")),
 }  # fmt: skip
+
+
+def test_runs_without_an_error_do_not_shift_the_median_that_is_drawn(monkeypatch):
+    ates = (3.0, None, 1.0, 2.0, None)
+    found = Found([entry("bow", "00", ate, seed) for seed, ate in enumerate(ates)], [])
+    asked = []
+
+    def no_trajectory(found: Found, run: RunEntry):
+        asked.append(run.measures["ate_rmse_m"])
+        raise InputError("no trajectory")
+
+    monkeypatch.setattr(figures, "read_aligned", no_trajectory)
+    figures.draw_overview(summarize(found), found)
+    assert asked == [2.0]
 
 
 def test_html_has_every_figure_and_loads_nothing(written):

@@ -162,7 +162,7 @@ def test_a_run_with_reader_perturbation_and_detector(target: Path, corridor, tmp
     assert "made with the detector thumbnail, a plug-in that is not installed here; install" in err
 
 
-def test_the_detector_of_the_page_finds_the_same_image(installed, corridor):
+def test_the_detector_of_the_page_finds_the_same_image(installed):
     """The first image appears again after enough keyframes. It is the only candidate."""
     require_detector("thumbnail")
     detector = create_detector("thumbnail", Config())

@@ -382,7 +382,7 @@ def test_a_window_that_is_closed_does_not_end_the_recording(tmp_path, window, re
     assert len(rows(tmp_path / "recording.rrd", entity)) == len(rows(recording, entity))
 
 
-def test_a_page_shows_the_run(tmp_path, monkeypatch, caplog):
+def test_a_page_shows_the_run(monkeypatch, caplog):
     from urllib.request import urlopen
 
     monkeypatch.delenv("DISPLAY", raising=False)

@@ -8,6 +8,7 @@ import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -316,6 +317,21 @@ def test_the_camera_of_the_node_is_that_of_its_messages(camera_of):
 def test_the_node_refuses_messages_of_no_rectified_pair(camera_of, pair, why):
     with pytest.raises(ValueError, match=why):
         camera_of(*pair)
+
+
+def test_the_node_leaves_ros_although_mapping_has_failed(monkeypatch):
+    ros = ("rclpy.node", "rclpy.qos", "message_filters", "nav_msgs.msg", "sensor_msgs.msg",
+           "tf2_msgs.msg", "camera")  # fmt: skip
+    for name in ros:
+        monkeypatch.setitem(sys.modules, name, Mock(Node=object))
+    monkeypatch.setitem(sys.modules, "rclpy", rclpy := Mock())
+    main = runpy.run_path(str(ROOT / "examples" / "ros2" / "node.py"))["main"]
+    main.__globals__["SlamNode"] = node = Mock()
+    rclpy.spin.side_effect = node().close.side_effect = RuntimeError("mapping failed")
+    with pytest.raises(RuntimeError, match="mapping failed"):
+        main()
+    node().destroy_node.assert_called_once_with()
+    rclpy.try_shutdown.assert_called_once_with()
 
 
 def test_the_node_is_a_program_of_at_most_150_lines():

@@ -81,7 +81,7 @@ def test_every_page_of_the_issue_is_there(pages, site):
 
 
 @pytest.mark.slow
-def test_no_link_within_the_site_is_broken(pages, site):
+def test_no_link_within_the_site_is_broken(pages):
     broken = []
     for path, page in pages.items():
         for link in page.links:

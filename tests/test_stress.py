@@ -400,14 +400,30 @@ def test_another_system_gets_no_dropped_frames_and_is_not_blamed_for_them(tmp_pa
     assert (report.frames, report.lost_frames) == (12, 0)
 
 
+def test_another_system_skips_an_unreadable_image_like_vslam(tmp_path):
+    root = make_kitti(tmp_path)
+    damaged = root / "sequences" / "00" / "image_1" / "000004.png"
+    damaged.write_bytes(damaged.read_bytes()[:200])
+    report = run_script(root, DRIVES)
+    assert (report.frames, report.lost_frames, report.dropped_frames) == (12, 1, 0)
+    (message,) = report.skipped_messages
+    assert message.startswith(f"frame 4: {damaged}: ")
+    assert 0.0 < report.ate_rmse_m < 0.1
+
+
 def test_frames_without_a_pose_are_lost(tmp_path):
     tum = """
 rows = [f"{t} {0.1 * (i % 3)} 0 {i} 0 0 0 1" for i, t in enumerate(times) if i not in (4, 5)]
 (out / "trajectory.txt").write_text("\\n".join(rows))
 """
-    report = run_script(make_kitti(tmp_path), tum)
+    states = """
+(out / "states.txt").write_text(" ".join(["OK"] * 8 + ["LOST"] * 4))
+"""
+    root = make_kitti(tmp_path)
+    report = run_script(root, tum)
     assert report.lost_frames == 2
     assert 0.0 < report.ate_rmse_m < 0.1  # unknown poses are interpolated
+    assert run_script(root, tum + states).lost_frames == 6
 
 
 def test_states_and_causal_poses_of_another_system_count(tmp_path):
@@ -443,7 +459,7 @@ def test_the_exported_folder_is_read_again(tmp_path):
     root = make_kitti(tmp_path / "data")
     sequence = open_kitti(root, "00")
     target = tmp_path / "again" / "sequences" / "00"
-    kept = export_kitti(sequence, parse_perturbation("stereo_gain:1", 0), target)
+    kept, _ = export_kitti(sequence, parse_perturbation("stereo_gain:1", 0), target)
     again = open_kitti(tmp_path / "again", "00")
     assert kept.tolist() == list(range(12))
     assert again.camera == sequence.camera

@@ -475,7 +475,7 @@ def test_change_between_passes(unpainted):
     assert len(things[1] - things[0]) > 10
 
 
-def test_sun_stands_still_within_a_pass_and_moves_behind_a_cloud(route, town):
+def test_sun_stands_still_within_a_pass_and_moves_behind_a_cloud(town):
     poses = there_and_back()
     drive = SimpleNamespace(T_wc=poses)
     passes = Passes(drive, town, Variation(change=0.6))

@@ -198,9 +198,7 @@ def test_a_drive_that_was_lost_is_tracked(corridor, change, lost):
 
 
 @pytest.mark.parametrize("window", [7.0, 0.01])
-def test_what_the_frame_before_did_not_see_is_matched_around_the_prediction(
-    corridor, window, monkeypatch
-):
+def test_what_the_frame_before_did_not_see_is_matched_around_the_prediction(corridor, window):
     """One half of a frame is dark, and the other half of the next frame.
 
     The two frames have no landmarks in common, but the map contains those of both. Without a search

@@ -183,10 +183,9 @@ def parse_case(text: str) -> Case:
     parts = place.rsplit(":", 2)
     if not separator or len(parts) != 3 or not parts[2].isdecimal():
         raise argparse.ArgumentTypeError(f"{text}: write TITLE=DATA:SEQ:FRAMES")
-    data = Path(parts[0]).absolute()
-    if not (data / "sequences" / parts[1]).is_dir():
-        raise argparse.ArgumentTypeError(f"{data / 'sequences' / parts[1]}: no such folder")
-    case = Case(title, data, parts[1], int(parts[2]))
+    case = Case(title, Path(parts[0]).absolute(), parts[1], int(parts[2]))
+    if missing := [side for side in sides(case) if not side.is_dir()]:
+        raise argparse.ArgumentTypeError(f"{missing[0]}: no such folder; give a KITTI sequence")
     here = min(len(list(side.iterdir())) for side in sides(case))
     if not 2 <= case.frames <= here:
         raise argparse.ArgumentTypeError(f"{text}: FRAMES must be from 2 to {here}")

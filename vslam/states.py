@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vslam.features import Features, KeyframePatches
 from vslam.geometry import Matrix
 from vslam.loops import LoopEdge, ResembledPlace
+from vslam.odometry import Odometry
 
 
 @dataclass(frozen=True)
@@ -156,4 +157,4 @@ class Checkpoint:
     policy: PolicyState
     closing: ClosingState
     rig: RigState = field(default_factory=RigState)
-    odometry: tuple[float, ...] = (*np.eye(4).ravel().tolist(), *[0.0] * 50)
+    odometry: tuple[float, ...] = field(default_factory=lambda: Odometry().state())

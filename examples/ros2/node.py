@@ -90,9 +90,11 @@ def main() -> None:
     except KeyboardInterrupt:
         pass
     finally:
-        node.close()
-        node.destroy_node()
-        rclpy.try_shutdown()
+        try:
+            node.close()  # fails again if mapping has failed
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()
 
 
 if __name__ == "__main__":

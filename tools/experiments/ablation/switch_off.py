@@ -64,13 +64,12 @@ VARIANTS = (
     Variant("global bundle adjustment", "loops.global_iterations=1"),
 )
 
+TOWN_CHANGES = ("change", "moving", "aliased")
 Drive = tuple[str, str, str, int | None]  # data set, drive, perturbation, seed of the town
 Measures = dict[str, float | None]
 
 
-def run(
-    variant: Variant, source: str, perturb: str, arguments: list[str], out: Path
-) -> dict[Drive, Measures]:
+def run(variant: Variant, source: str, arguments: list[str], out: Path) -> dict[Drive, Measures]:
     """Run a variant on the drives of a source. Runs that are already finished are not repeated."""
     command = ["vslam", "bench", *shlex.split(source), *arguments]
     if variant.thresholds:
@@ -79,18 +78,16 @@ def run(
     if subprocess.run(command).returncode:
         raise SystemExit(f"{shlex.join(command)} failed")
     report = OverviewJson.model_validate_json((out / "report.json").read_bytes())
-
-    def applied(perturbs: str) -> str:
-        """Return the perturbation without changes of the town, such as moving cars."""
-        for one in perturb.split(","):
-            if one != "none" and perturbs.endswith(one.replace("+", ",")):
-                return one
-        return "none"
-
     return {
         (one.drive.dataset, str(one.drive), applied(one.drive.perturb), one.town): one.measures
         for one in report.runs
     }
+
+
+def applied(perturb: str) -> str:
+    """Return the ``--perturb`` of a drive, without changes of the town such as moving cars."""
+    laws = [law for law in perturb.split(",") if law.partition(":")[0] not in TOWN_CHANGES]
+    return "+".join(laws) or "none"
 
 
 def row_of(
@@ -145,12 +142,14 @@ def main() -> None:
     arguments = ["--perturb", options.perturb, "--jobs", options.jobs]
     runs: dict[str, dict[Drive, Measures]] = {}
     rows = []
-    chosen = [one for one in VARIANTS if one.piece == "nothing" or options.only in one.piece]
+    named = [one for one in VARIANTS if options.only in one.piece]
+    references = {"nothing", *(one.reference for one in named)}
+    chosen = [one for one in VARIANTS if one in named or one.piece in references]
     for variant in chosen:
         runs[variant.piece] = {}
         for k, source in enumerate(options.source):
             folder = options.out / variant.piece.replace(" ", "-") / str(k)
-            runs[variant.piece] |= run(variant, source, options.perturb, arguments, folder)
+            runs[variant.piece] |= run(variant, source, arguments, folder)
         rows += [
             row_of(variant, condition, runs[variant.piece], runs[variant.reference])
             for condition in dict.fromkeys((one[0], one[2]) for one in runs[variant.piece])

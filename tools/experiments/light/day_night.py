@@ -132,6 +132,11 @@ def rows_of(source: Source, n_map: int | None, options: argparse.Namespace) -> I
         with tempfile.TemporaryDirectory() as folder:
             day = map_of(source, n_map or n, detector, Path(folder) / "map.npz")
             queries = [k for k in range(n_map or 0, n, options.every) if k not in day.keyframes]
+            if not queries:
+                raise SystemExit(
+                    f"{source.name}: no image is left to localise; give a smaller MAP_FRAMES or "
+                    "--every."
+                )
             for candidates in options.candidates:
                 localiser = Localiser(day, detector, candidates)
                 for law in options.laws:

@@ -26,9 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import LearnedMatchingConfig
-from vslam.lab.loopbench.detectors import LocalDescriptorCache, NetworkScorer
+from vslam.lab.loopbench.detectors import NetworkScorer
 from vslam.lab.loopbench.measure import LEAST_COSINE, MIN_CELLS
 from vslam.loopclosure.local_matching import homography_inliers, homography_share, match_coarse
+from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
 
 MIN_SHARE = 0.18
 WEBCAMS = "webcams"
@@ -66,7 +67,11 @@ def measure(folder: Path, of_place: int) -> tuple[NDArray[np.bool_], NDArray[np.
             places.append(place.name)
     rng, place = np.random.default_rng(0), np.array(places)
     queries = [warped(image, rng) for image in gallery] if folder.name == WEBCAMS else gallery
-    scorer, local = NetworkScorer("capsule"), LocalDescriptorCache()
+    scorer, network = NetworkScorer("capsule"), LocalDescriptors()
+    of_gallery = [network.describe(image).coarse_alone() for image in gallery]
+    of_queries = of_gallery
+    if queries is not gallery:
+        of_queries = [network.describe(image).coarse_alone() for image in queries]
     stored = scorer.embed(gallery)
     pairs: tuple[list[tuple[bool, bool]], ...] = ([], [])
     for q, embedded in enumerate(scorer.embed(queries)):
@@ -76,7 +81,7 @@ def measure(folder: Path, of_place: int) -> tuple[NDArray[np.bool_], NDArray[np.
         same = rng.permutation(same) if folder.name == WEBCAMS else same
         for found, images in zip(pairs, (same[:1], other[:2]), strict=True):
             for g in images:
-                a, b = local.of(queries[q]), local.of(gallery[g])
+                a, b = of_queries[q], of_gallery[g]
                 loose = match_coarse(a, b, LearnedMatchingConfig().min_coarse_similarity)
                 cells = homography_inliers(match_coarse(a, b, LEAST_COSINE), a, b)
                 found.append((homography_share(loose, a, b) >= MIN_SHARE, cells >= MIN_CELLS))

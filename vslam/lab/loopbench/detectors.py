@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ _MATCHING_LEVEL = 2  # vocabulary level with about 100 nodes; features are match
 _KEPT_GALLERIES = 3  # galleries that are cached: the unchanged town, and those of two strengths
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DescribedImage:
     """An image with its ORB features.
 
@@ -166,26 +167,28 @@ class NetworkScorer:
 
 
 class LocalDescriptorCache:
-    """The coarse local descriptors of images, computed once per image."""
+    """The coarse local descriptors of images, computed once per image.
+
+    They are kept as long as the image is used.
+    """
 
     def __init__(self) -> None:
         self._network: LocalDescriptors | None = None
-        self._kept: dict[bytes, DescriptorMaps] = {}
+        self._kept: WeakKeyDictionary[DescribedImage, DescriptorMaps] = WeakKeyDictionary()
 
-    def of(self, image: Image) -> DescriptorMaps:
-        """Return the coarse local descriptors of an ``(H, W)`` uint8 grey image.
+    def of(self, described: DescribedImage) -> DescriptorMaps:
+        """Return the coarse local descriptors of an image.
 
         Raises:
             InputError: the local-descriptor network cannot be read.
         """
-        digest = hashlib.blake2b(image.tobytes()).digest()
-        if digest not in self._kept:
+        if described not in self._kept:
             if self._network is None:
                 from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
 
                 self._network = LocalDescriptors()
-            self._kept[digest] = self._network.describe(image).coarse_alone()
-        return self._kept[digest]
+            self._kept[described] = self._network.describe(described.image).coarse_alone()
+        return self._kept[described]
 
 
 class DetectorSet:

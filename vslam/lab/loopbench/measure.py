@@ -221,8 +221,7 @@ class Verification:
         """
         key = query, image
         if key not in self._by_learned:
-            a = self._local.of(self._queries[query].image)
-            b = self._local.of(self._gallery[image].image)
+            a, b = self._local.of(self._queries[query]), self._local.of(self._gallery[image])
             matches = match_coarse(a, b, LEAST_COSINE)
             self._by_learned[key] = homography_inliers(matches, a, b) >= MIN_CELLS
         return self._by_learned[key]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
+from vslam.errors import InputError, counted
 from vslam.lab.loopbench.conditions import Condition, Image, apply
 from vslam.loopclosure.siamese.image_source import UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.source_registry import open_source, split_spec
@@ -72,10 +72,11 @@ def open_set(spec: str, cache: Path, *, threads: int, progress_bar: ProgressBar)
         cache: folder of rendered towns.
 
     Raises:
-        InputError: the kind, route or an option is unknown, or the data is missing or malformed.
+        InputError: the kind, route or an option is unknown, the data is missing or malformed, or a
+            drive is too short for queries.
     """
     if split_spec(spec)[0] != "town":
-        return [_images(source) for source in open_source(spec)]
+        return [_images(spec, source) for source in open_source(spec)]
     route, given = rendered_route(spec, {"seed": 0, "aliased": 0, "places": 150})
     seed, aliased, places = given.values()
     return [
@@ -105,8 +106,13 @@ def rendered_route(spec: str, defaults: dict[str, Any]) -> tuple[str, dict[str, 
         raise InputError(f"--data {spec}: one of the options is not a number.") from error
 
 
-def _images(source: ImageSource) -> TestSet:
+def _images(spec: str, source: ImageSource) -> TestSet:
     is_query = source.is_query
+    if is_query is None and len(source) <= _GAP:
+        raise InputError(
+            f"--data {spec}: {source.name} has only {counted(len(source), 'image')}; give more "
+            f"than {_GAP}."
+        )
     index = np.arange(len(source))
     queries = index if is_query is None else np.flatnonzero(is_query)
     gallery = index if is_query is None else np.flatnonzero(~is_query)

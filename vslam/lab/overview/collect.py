@@ -217,6 +217,7 @@ def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
     except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise InputError(f"{path.name} is damaged") from error
     options = {name: getattr(report, name) for name in _OPTIONS}
+    options["calib"] = " ".join(map(str, report.calib))
     options["method"] = report.versions.get("method")
     return changed | {name: str(value) for name, value in options.items() if value}
 

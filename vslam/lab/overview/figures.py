@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -182,12 +182,10 @@ def _draw_paths(axes: Axes, rows: list[Row], found: Found, looks: Looks) -> int:
     return drawn
 
 
-def _median_run(runs: Iterable[RunEntry]) -> RunEntry:
-    def ate(run: RunEntry) -> float:
-        value = run.measures["ate_rmse_m"]
-        return float("inf") if value is None else value
-
-    ordered = sorted(runs, key=ate)
+def _median_run(runs: list[RunEntry]) -> RunEntry:
+    """Return the run with the median ATE of the runs whose ATE is known."""
+    known = [run for run in runs if run.measures["ate_rmse_m"] is not None]
+    ordered = sorted(known or runs, key=lambda run: run.measures["ate_rmse_m"] or 0.0)
     return ordered[(len(ordered) - 1) // 2]
 
 

@@ -81,7 +81,7 @@ def make_server(folders: Sequence[Path], port: int = 0) -> http.server.Threading
         def do_GET(self) -> None:
             host = (self.headers.get("Host") or "").partition(":")[0]
             status, text = pages.answer(self.path) if host in _HOST_NAMES else (403, "forbidden")
-            is_ours = self.path == "/" or self.path.startswith("/compare?")
+            is_ours = self.path.partition("?")[0] in ("/", "/compare")
             body = text.encode()
             self.send_response(status)
             for name, value in {

@@ -2,8 +2,8 @@
 
 The command of a system is a template with the placeholders ``{folder}`` and ``{out}``. The folder
 at ``{folder}`` is in KITTI's format. It contains ``image_0``, ``image_1``, ``calib.txt`` and
-``times.txt`` of the perturbed frames, without dropped frames. The command must write these files
-into the folder at ``{out}``:
+``times.txt`` of the perturbed frames, without dropped frames and frames with an unreadable image.
+The command must write these files into the folder at ``{out}``:
 
 - ``trajectory.txt`` contains the estimated poses. It has either one pose per frame in KITTI's
   format, or poses with times in TUM's format.
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.synthetic.store import calibration_text
-from vslam.errors import DroppedFrameError, InputError, ResultsError
+from vslam.errors import DroppedFrameError, InputError, ResultsError, UnreadableImageError
 from vslam.features import TrackingState, TrackResult
 from vslam.report.folder import write_results
 from vslam.report.schema import ReportJson
@@ -97,11 +97,11 @@ def run_external(
         work = Path(name)
         out = work / "out"
         out.mkdir()
-        kept = export_kitti(sequence, perturbation, work / "sequence")
+        kept, unreadable = export_kitti(sequence, perturbation, work / "sequence")
         start = time.perf_counter()
         _call(template, work / "sequence", out)
         wall = time.perf_counter() - start
-        outcome = _outcome(sequence, settings, kept, out, wall)
+        outcome = _outcome(sequence, settings, kept, unreadable, out, wall)
     report = write_results(folder, outcome, pages=False)
     report = report.model_copy(
         update={"loops_found": None, "loops_missed": None, "loops_wrong": None}
@@ -110,16 +110,22 @@ def run_external(
     return report
 
 
-def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> NDArray[np.int64]:
-    """Write the perturbed frames of a sequence in KITTI's format, without dropped frames.
+def export_kitti(
+    sequence: Source, perturbation: Perturbation, folder: Path
+) -> tuple[NDArray[np.int64], dict[int, str]]:
+    """Write the perturbed frames of a sequence in KITTI's format.
+
+    Dropped frames and frames with an unreadable image are left out.
 
     Returns:
-        The indices of the written frames.
+        The indices of the written frames, and the error message of each frame with an unreadable
+        image by the index of the frame.
     """
     import cv2
 
     times: list[float] = []
     kept: list[int] = []
+    unreadable: dict[int, str] = {}
     for name in ("image_0", "image_1"):
         (folder / name).mkdir(parents=True)
     frames = perturbed(sequence.frames(), perturbation.bound_to(sequence))
@@ -127,6 +133,9 @@ def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> 
         try:
             images = frame.read(map)
         except DroppedFrameError:
+            continue
+        except UnreadableImageError as error:
+            unreadable[index] = str(error)
             continue
         for side, image in enumerate(images):
             if image is not None and image.dtype == np.uint8:
@@ -137,7 +146,7 @@ def export_kitti(sequence: Source, perturbation: Perturbation, folder: Path) -> 
         times.append(frame.timestamp - float(sequence.timestamps[0]))
     (folder / "times.txt").write_text("".join(f"{t:.9e}\n" for t in times))
     (folder / "calib.txt").write_text(calibration_text(sequence.camera))
-    return np.array(kept, np.int64)
+    return np.array(kept, np.int64), unreadable
 
 
 def _call(template: str, sequence: Path, out: Path) -> None:
@@ -166,7 +175,12 @@ def _call(template: str, sequence: Path, out: Path) -> None:
 
 
 def _outcome(
-    sequence: Source, settings: RunOptions, kept: NDArray[np.int64], out: Path, wall: float
+    sequence: Source,
+    settings: RunOptions,
+    kept: NDArray[np.int64],
+    unreadable: dict[int, str],
+    out: Path,
+    wall: float,
 ) -> RunOutcome:
     if not (out / "trajectory.txt").is_file():
         raise InputError(f"{settings.detector}: wrote no trajectory.txt into {{out}}.")
@@ -182,9 +196,9 @@ def _outcome(
             raise InputError(
                 f"{settings.detector}: states.txt has {len(states)} states for {len(kept)} frames."
             )
-        lost[kept] = np.array(states) != "OK"
+        lost[kept] |= np.array(states) != "OK"
     dropped = np.ones(len(times), bool)
-    dropped[kept] = False
+    dropped[[*kept, *unreadable]] = False
     trajectory = final.bridged(times)
     given = np.where(causal.known[:, None, None], causal.T_wc, _last_known(causal))
     tracks = [
@@ -202,7 +216,7 @@ def _outcome(
         trajectory=trajectory,
         keyframes=Trajectory(times[:0], trajectory.T_wc[:0]),
         tracks=tracks,
-        skipped=[],
+        skipped=[f"frame {index}: {message}" for index, message in unreadable.items()],
         wall_s=wall,
         cpu_s=0.0,
         startup_s=0.0,
@@ -222,7 +236,7 @@ def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) 
     Args:
         path: file in KITTI's or TUM's format.
         times: ``(N,)`` times of the frames in seconds.
-        kept: indices of the frames that the system received, without dropped frames.
+        kept: indices of the frames that the system received.
 
     Raises:
         InputError: the file is malformed.

@@ -414,8 +414,15 @@ def _observed_points(
 def observations(
     frame: Frame, feature: NDArray[np.integer], context: TrackingContext
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return two arrays for ``(N,)`` features of a frame: their ``(N, 3)`` float64 u, v, u_right,
-    in pixels, and the ``(N,)`` float64 inverse variances of u and v."""
+    """Return the observed image positions of N features of a frame, and their weights.
+
+    Args:
+        feature: ``(N,)`` indices of the features.
+
+    Returns:
+        ``(N, 3)`` float64 u, v and u_right in pixels, and ``(N,)`` float64 inverse variances of u
+        and v.
+    """
     features = frame.features
     uvr = stack_uvr(features.xy[feature], features.u_right[feature])
     return uvr, context.scales[features.octave[feature]] ** -2.0

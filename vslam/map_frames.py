@@ -194,7 +194,7 @@ def keyframe_trajectory(map_: Map) -> Trajectory:
 def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FrameTable) -> NDArray[np.bool_]:
     """Return an ``(N,)`` bool array, True for frames that were tracked in the first sub-map.
 
-    Sub-maps that closed loops have joined to the first sub-map count as part of it.
+    If a closed loop has joined another sub-map to the first one, its frames count as well.
     """
     if not map_.n_keyframes:
         return frames.tracked

@@ -1,4 +1,4 @@
-"""Compare two tests that decide whether two images show the same place, on photographs.
+"""Compare two tests that decide whether two photographs show the same place.
 
     python tools/experiments/local_descriptors/image_test.py PHOTOS multiview webcams
 

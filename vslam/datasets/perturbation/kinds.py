@@ -1,4 +1,4 @@
-"""Types of laws (kinds of perturbation).
+"""The types of perturbations. vslam calls a kind of perturbation a law.
 
 Some laws change one image at a time. Others need both images of a frame, or the scene.
 """

@@ -19,7 +19,7 @@ _POOL_CELL, _POOL_REACH = 0.5, 16.0  # m
 class ShadowMap(NamedTuple):
     """The highest occluder on each sun ray.
 
-    A sun ray belongs to the cell where it meets the height 0.
+    A sun ray belongs to the cell in which it reaches the height 0.
 
     Attributes:
         height_cm: ``(R, C)`` uint16 height of the highest occluder above the reference height in

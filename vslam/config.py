@@ -246,8 +246,8 @@ class TrackingConfig(Section):
     with the previous frame are inliers. [own]"""
     min_inliers_frame: int = Field(10, ge=3)
     """A frame is matched with the local map only if tracking from the previous frame, from the
-    reference keyframe or with `predicted_window` gives at least this many inliers. Otherwise, the
-    frame is LOST. [OS1 V-B, customary]"""
+    reference keyframe, with `predicted_window` or with `sudden_window` gives at least this many
+    inliers. Otherwise, the frame is LOST. [OS1 V-B, customary]"""
     min_inliers: int = Field(30, ge=3)
     """A frame with fewer inliers than this in the local map is WEAK. Its pose is used, but it is
     reported as uncertain. [OS1 V-D, customary]"""

@@ -221,6 +221,13 @@ def test_aprilgrid_of_kalibr_in_euroc_layout_by_fisheye_cameras(calibrate, tmp_p
     check_pair(read_calibration(["calibration.yaml"]), FISHEYE)
 
 
+def test_a_board_has_an_integer_size(tmp_path):
+    path = tmp_path / "april.yaml"
+    path.write_text(KALIBR.replace("Cols: 4", "Cols: 4.7"))
+    with pytest.raises(InputError, match=r"april.yaml: tagCols must be one integer\."):
+        read_board(path)
+
+
 @pytest.mark.parametrize("border", [1, 2])
 def test_aprilgrid_of_upright_tags(border):
     upright = Renderer(APRILGRID, PINHOLE, border=border, upright=True)

@@ -143,7 +143,7 @@ def read_board(path: Path) -> Board:
         raise InputError(
             f"{path}: the target_type {kind} is unknown; use an aprilgrid or a checkerboard."
         )
-    columns, rows = (int(document.number(name)) for name in names)
+    columns, rows = (document.integers(name, 1)[0] for name in names)
     try:
         return Board(cast("Kind", kind), columns, rows, square, marker)
     except InputError as error:

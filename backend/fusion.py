@@ -57,7 +57,7 @@ def fuse_loop(
     match_side: list[int],
     camera: Camera,
     config: Config,
-) -> int:
+) -> None:
     """Fuse the landmarks on the two sides of a loop, after the loop was corrected (section VII-D of
     the ORB-SLAM paper).
 
@@ -68,30 +68,25 @@ def fuse_loop(
         edge: the loop. Its ``features`` and ``landmarks`` must be set.
         query_side, match_side: ids of the keyframes around the two ends of the loop. Their poses
             must already be corrected.
-
-    Returns:
-        Number of fusions.
     """
     assert edge.features is not None
     assert edge.landmarks is not None
     a = map_.arrays
     first = map_.rows(edge.query).start
-    fused = _fuse_pairs(a, first + edge.features.astype(np.int64), edge.landmarks, edge.query)
+    _fuse_pairs(a, first + edge.features.astype(np.int64), edge.landmarks, edge.query)
     old = collect_landmarks(a, np.array(match_side, np.int64), map_.n_landmarks)
     for keyframe in query_side:
-        fused += fuse_into(map_, old, keyframe, camera, config)
+        fuse_into(map_, old, keyframe, camera, config)
     new = collect_landmarks(a, np.array(query_side, np.int64), map_.n_landmarks)
     for keyframe in match_side:
-        fused += fuse_into(map_, new, keyframe, camera, config)
-    return fused
+        fuse_into(map_, new, keyframe, camera, config)
 
 
 @kernel
 def _fuse_pairs(a, rows, landmarks, keyframe):
     """Assign each of the given landmarks to a feature of a keyframe. If the feature already
     observes another landmark, the two landmarks are merged. ``rows`` gives the row of each feature
-    in the observation arrays of the map. Returns the number of fusions."""
-    fused = 0
+    in the observation arrays of the map."""
     for i in range(len(rows)):
         row, landmark = rows[i], landmarks[i]
         own = a.landmark[row]
@@ -101,10 +96,6 @@ def _fuse_pairs(a, rows, landmarks, keyframe):
             merge_landmarks(a, own, landmark)
         elif observed_by(a, landmark, keyframe) < 0:
             link(a, row, landmark)
-        else:
-            continue
-        fused += 1
-    return fused
 
 
 def fuse_into(

@@ -344,10 +344,9 @@ def _likeliest(
     held = gtsam.noiseModel.Isotropic.Sigma(6, _HELD)
     best, least = None, np.inf
     for drift in _DRIFTS:
-        vision, fixes, start = factors(drift=drift)
-        both = gtsam.NonlinearFactorGraph(vision)
-        both.push_back(fixes)
-        result = minimised(both, start, config)
+        found = factors(drift=drift)
+        vision, both = found.vision, found.both()
+        result = minimised(both, found.start, config)
         after = _log_determinant(both, result)
         # Vision alone does not determine where each part of the map is, so each part is held.
         for i in np.unique(part, return_index=True)[1].tolist():
@@ -370,8 +369,7 @@ def _log_determinant(factors: Any, values: Any) -> float:
 
 
 def _optimised(factors: _Factors, config: PoseGraphConfig) -> Array:
-    factors.vision.push_back(factors.fixes)
-    return _poses(minimised(factors.vision, factors.start, config))
+    return _poses(minimised(factors.both(), factors.start, config))
 
 
 def _poses(values: Any) -> Array:
@@ -390,6 +388,14 @@ class _Factors(NamedTuple):
     vision: Any
     fixes: Any
     start: Any
+
+    def both(self) -> Any:
+        """Return a new ``gtsam.NonlinearFactorGraph`` of the edges and the fixes."""
+        import gtsam
+
+        both = gtsam.NonlinearFactorGraph(self.vision)
+        both.push_back(self.fixes)
+        return both
 
 
 def _factors(

@@ -62,19 +62,10 @@ class GraphCheck:
     Attributes:
         consistent: whether the edges agree, so that the correction is plausible.
         reason: "consistent", or a short explanation of why the correction is not plausible.
-        strain: total chi-square of the tree, covisibility and gap edges. It measures how much drift
-            the correction assumes, relative to the drift model.
-        closed: number of loop edges that were violated before the optimisation. The limit on the
-            strain is proportional to this number.
-        loop_error: ``(E,)`` chi-square of each loop edge after the optimisation; NaN for other
-            edges.
     """
 
     consistent: bool
     reason: str
-    strain: float
-    closed: int
-    loop_error: NDArray[np.float64]
 
 
 def essential_graph(
@@ -327,8 +318,9 @@ def check_pose_graph(
 
     The second test checks the strain: the total chi-square of the tree, covisibility and gap edges.
     If the drift follows the model, the strain has six degrees of freedom per closed loop. If the
-    strain is several times larger, no plausible drift explains the loop. A single loop across a
-    WEAK edge always passes the tests, because it causes no strain.
+    strain is several times larger, no plausible drift explains the loop. Only loops whose edges
+    were violated before the optimisation are counted. A single loop across a WEAK edge always
+    passes the tests, because it causes no strain.
 
     Args:
         T_cw: ``(N, 4, 4)`` poses that ``optimise`` returned.
@@ -360,7 +352,7 @@ def check_edge_errors(
         )
     elif strain > config.max_strain * max(1, closed):
         reason = f"the loop implies more drift than is plausible (chi-square {strain:.0f})"
-    return GraphCheck(reason == "consistent", reason, strain, closed, loop_error)
+    return GraphCheck(reason == "consistent", reason)
 
 
 @kernel

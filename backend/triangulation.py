@@ -46,16 +46,13 @@ def map_stereo_points(
     return ids
 
 
-def triangulate_with_neighbours(
-    map_: Map, keyframe: int, camera: Camera, config: Config
-) -> NDArray[np.int32]:
+def triangulate_with_neighbours(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Create landmarks by triangulating features of a keyframe and its covisible keyframes.
 
     Features that observe no landmark yet are matched along epipolar lines (section VI-C of the
-    ORB-SLAM paper). Returns the ``(N,)`` ids of the new landmarks.
+    ORB-SLAM paper).
     """
     neighbours, _ = map_.covisible(keyframe)
-    created = [np.empty(0, np.int32)]
     limit, min_baseline = config.mapping.neighbours, camera.baseline
     if camera.monocular:
         limit = config.mapping.monocular_neighbours
@@ -79,8 +76,6 @@ def triangulate_with_neighbours(
         link_many(map_.arrays, rows_2, ids)
         # The match was not aligned, so its position is no more accurate than that of a keypoint.
         map_.arrays.certainty[rows_2] = 1
-        created.append(ids)
-    return np.concatenate(created)
 
 
 def median_depth(map_: Map, keyframe: int) -> float:

@@ -182,12 +182,13 @@ def matched(
     """
     camera, config = context.camera, context.config
     found, matches, depth, side, _ = corners
+    # Without a pyramid, matches are not aligned. Depth cameras have a rolling shutter, which moves
+    # points by more than alignment corrects.
+    pyramid = None if camera.depth else found.pyramid
     if depth is not None:
         scale = context.scales[found.octave]
         u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
-        # No pyramid, so that matches are not aligned: depth cameras have a rolling shutter, which
-        # moves points by more than alignment corrects.
-        return Extracted(_features(found, u_right))
+        return Extracted(_features(found, u_right), pyramid)
     if keypoints is not None and side == Side.LEFT:
         more = extract_at(found, *keypoints)
         found, order = found.joined(more)
@@ -196,10 +197,10 @@ def matched(
             matches = matches.joined(added, order)
     if matches is None:
         u_right = np.full(len(found.xy), np.nan, np.float32)
-        return Extracted(_features(found, u_right), found.pyramid, side=side)
+        return Extracted(_features(found, u_right), pyramid, side=side)
     u_right = inliers_only(matches, found.octave)
     rows = row_offsets(found, matches.right, u_right, config.stereo)
-    return Extracted(_features(found, u_right), found.pyramid, rows)
+    return Extracted(_features(found, u_right), pyramid, rows)
 
 
 def _corners_alone(

@@ -56,7 +56,7 @@ def pose_covariance(
     uvr: NDArray[np.float64],
     inverse_sigma2: NDArray[np.float64],
     intrinsics: NDArray[np.float64],
-    disparity_weight: NDArray[np.float64] | None = None,
+    disparity_weight: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Estimate the covariance of an optimised pose relative to the landmarks.
 
@@ -78,8 +78,6 @@ def pose_covariance(
         ``(6, 6)`` covariance of ``xi = [v, w]``, in metres and radians, where ``exp(xi) T_cw`` is
         the true pose. NaN if the observations do not determine the pose.
     """
-    if disparity_weight is None:
-        disparity_weight = np.full(len(points), intrinsics[5])
     cell = np.floor(uvr[:, :2] / CELL).astype(np.int64) @ np.array([1, 1 << 20])
     order = np.argsort(cell, kind="stable")
     _, first = np.unique(cell[order], return_index=True)

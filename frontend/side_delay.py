@@ -249,21 +249,21 @@ class SideDelay:
         twist: Matrix | None,
         scales: NDArray[np.float64],
     ) -> None:
-        """Add the measurements of a tracked frame. A frame without row offsets or with an unknown
-        velocity is skipped.
+        """Add a tracked frame. If its velocity is unknown, it is skipped, and so is the frame
+        before it.
 
         Args:
-            row_offset: ``Extracted.row_offset``.
+            row_offset: ``Extracted.row_offset``; None adds only the velocity.
             twist: ``(6,)`` mean velocity since the previous frame, see ``Frame.twist``.
             scales: ``(levels,)`` pyramid scale factors.
         """
         state = self._state
-        if row_offset is None or twist is None:
-            state.waiting[:] = 0.0
-            return
-        self._add_waiting(0.5 * (state.twist + twist))
-        state.twist = twist
-        state.waiting = self._moments(features, row_offset, twist, scales)
+        if twist is not None:
+            self._add_waiting(0.5 * (state.twist + twist))
+            state.twist = twist
+        state.waiting = np.zeros(_WAITING)
+        if row_offset is not None and twist is not None:
+            state.waiting = self._moments(features, row_offset, twist, scales)
 
     def state(self) -> DelayState:
         """Return the state for a map file or a checkpoint."""

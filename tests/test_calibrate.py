@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rendered_boards import Renderer
+from rendered_boards import Renderer, texture
 from source_files import write_images, write_video
 
 from vslam.calibration.boards import (
@@ -175,6 +175,19 @@ def test_another_board_than_the_given_one_is_named_with_its_options(calibrate, t
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("columns", "rows", "seen_rows"), [(8, 6, 6), (12, 9, 8)])
+def test_charuco_boards_of_any_size_are_recognised(columns, rows, seen_rows):
+    """Some of the sizes that are tried need more markers than the recognised ones."""
+    board = Board("charuco", columns, rows, 0.04, 0.03, "4X4_1000")
+    printed, scale, origin = texture(board)
+    image = printed[: int(origin[1] + (seen_rows + 0.5) * board.square * scale)]
+    assert other_board(board, [image]) == ""
+    least = "4X4_50" if columns == 8 else "4X4_100"
+    said = f"--board charuco --size {columns}x{rows} --dictionary {least}, and measure"
+    assert said in other_board(replace(board, dictionary="5X5_1000"), [image])
+
+
+@pytest.mark.slow
 def test_charuco_board_in_a_side_by_side_video(calibrate, tmp_path):
     views = poses(CHARUCO, PINHOLE, 14)
     right = [np.linalg.inv(T_LEFT_RIGHT) @ T for T in views]
@@ -206,6 +219,13 @@ def test_aprilgrid_of_kalibr_in_euroc_layout_by_fisheye_cameras(calibrate, tmp_p
     assert "warning: " in err
     assert "1 of 14 images are left out because no right image is within 5 ms of them" in err
     check_pair(read_calibration(["calibration.yaml"]), FISHEYE)
+
+
+def test_a_board_has_an_integer_size(tmp_path):
+    path = tmp_path / "april.yaml"
+    path.write_text(KALIBR.replace("Cols: 4", "Cols: 4.7"))
+    with pytest.raises(InputError, match=r"april.yaml: tagCols must be one integer\."):
+        read_board(path)
 
 
 @pytest.mark.parametrize("border", [1, 2])

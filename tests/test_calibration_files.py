@@ -334,6 +334,8 @@ IDENTITY = "T_left_right: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
         (f"{SETTINGS}DepthMapFactor: 0\n", "DepthMapFactor is 0 but must be positive"),
         (f"{SETTINGS}Camera.bf: -40\nDepthMapFactor: 5000\n", "Camera.bf is -40 but must be"),
         (f"{SETTINGS}Camera.bf: 0\n", "Camera.bf is 0 but must be positive"),
+        (f"left: {ONE.replace('752', '752.9')}\n", "left: size must be 2 integers"),
+        (f"{SETTINGS}Camera.width: 640.5\nCamera.height: 480\n", "width must be one integer"),
     ],
 )
 def test_contradictions_and_numbers_that_cannot_be(tmp_path, text, words):

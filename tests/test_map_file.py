@@ -329,9 +329,17 @@ def damage(name: str, position: tuple[int, ...], value: float):
     return pytest.param(apply, id=f"{name}-{value}")
 
 
+def mirror(file: Path, to: Path) -> Path:
+    with np.load(file) as data:
+        T_cw = data["keyframe_T_cw"].copy()
+    T_cw[2, :, 0] *= -1.0
+    return changed(file, to, keyframe_T_cw=T_cw)
+
+
 @pytest.mark.parametrize(
     "apply",
     [
+        mirror,
         damage("keyframe_T_cw", (2, 0, 3), np.nan),
         damage("keyframe_T_cw", (2, 0, 0), 5.0),
         damage("keyframe_T_cw", (2, 3, 0), 1.0),

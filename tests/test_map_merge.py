@@ -17,6 +17,7 @@ from vslam.errors import InputError
 from vslam.features import Extracted
 from vslam.geometry import inverse, inverses
 from vslam.loopclosure.registry import create_detector
+from vslam.loops import PerKeyframe
 from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap, appended, in_box, near_frames, near_point
 from vslam.merging import merge_maps
@@ -48,6 +49,13 @@ def drives(ring) -> list[StoredMap]:
 @pytest.fixture(scope="module")
 def elsewhere() -> StoredMap:
     return driven(Ring.create(seed=5), range(60), 9)
+
+
+def jpegs(drive: StoredMap, content: int) -> PerKeyframe:
+    """Return files of four bytes that begin like JPEG files."""
+    n = drive.map.n_keyframes
+    files = np.array([[255, 216, 255, content]] * n, np.uint8)
+    return PerKeyframe(np.arange(0, 4 * n + 1, 4), files.ravel())
 
 
 def create():
@@ -82,6 +90,22 @@ def test_an_appended_map_is_as_it_was(drives, check_map):
     assert both.drives == ("ring 0", "ring 110")
     # Each drive is a separate part until a loop joins them.
     assert np.unique(both.map.submaps()).tolist() == [0, n]
+
+
+@pytest.mark.parametrize("with_images", [(0,), (1,), (0, 1)])
+def test_images_are_kept_if_only_one_map_has_them(drives, with_images, tmp_path):
+    one, other = (
+        replace(drive, images=jpegs(drive, k)) if k in with_images else drive
+        for k, drive in enumerate(drives[:2])
+    )
+    both, n = appended(one, other), one.map.n_keyframes
+    save_map(tmp_path / "both.npz", both)
+    images = load_map(tmp_path / "both.npz").images
+    assert images is not None
+    assert len(images) == n + other.map.n_keyframes
+    for k, keyframe in enumerate((3, n + 3)):
+        assert images.of(keyframe).tolist() == ([255, 216, 255, k] if k in with_images else [])
+    assert appended(*drives[:2]).images is None
 
 
 def test_drives_that_meet_become_one_map(drives, ring, check_map, tmp_path):

@@ -43,6 +43,11 @@ def some_covariance(scale: float = 1.0, seed: int = 0) -> np.ndarray:
     return scale * (root @ root.T + np.eye(6))
 
 
+def covariance(T: np.ndarray, points: np.ndarray, uvr: np.ndarray, weight: np.ndarray):
+    disparity_weight = np.full(len(points), CAMERA.intrinsics[5])
+    return pose_covariance(T, points, uvr, weight, CAMERA.intrinsics, disparity_weight)
+
+
 def test_the_adjoint_carries_a_small_motion_to_the_other_side_of_a_pose():
     xi = np.array([0.02, -0.01, 0.03, 0.01, -0.02, 0.015])
     np.testing.assert_allclose(
@@ -63,7 +68,7 @@ def test_errors_of_a_pose_are_those_that_its_covariance_predicts(kind, believed)
     for seed in range(200):
         points, uvr, weight = observations(kind, n=500, noise=believed, seed=seed)
         T, inlier = optimise_pose(TRUTH, points, uvr, weight, CAMERA.intrinsics)
-        C = pose_covariance(T, points[inlier], uvr[inlier], weight[inlier], CAMERA.intrinsics)
+        C = covariance(T, points[inlier], uvr[inlier], weight[inlier])
         xi = se3_log(TRUTH @ inverse(T))
         squared.append(xi @ np.linalg.inv(C) @ xi / 6.0)
     assert 0.8 < np.mean(squared) < (1.25 if believed < 1.0 else 1.5)
@@ -83,9 +88,9 @@ def test_the_covariance_holds_where_errors_are_unequal_and_neighbours_share_them
         points, uvr = np.tile(points, (4, 1)), np.tile(uvr, (4, 1))
         uvr[:, :2] += rng.normal(0.0, 0.05, (1000, 2))
         T, inlier = optimise_pose(TRUTH, points, uvr, np.ones(1000), CAMERA.intrinsics)
-        seen = T, points[inlier], uvr[inlier], np.ones(int(inlier.sum())), CAMERA.intrinsics
+        seen = T, points[inlier], uvr[inlier], np.ones(int(inlier.sum()))
         xi = se3_log(TRUTH @ inverse(T))
-        squared.append(xi @ np.linalg.inv(pose_covariance(*seen)) @ xi / 6.0)
+        squared.append(xi @ np.linalg.inv(covariance(*seen)) @ xi / 6.0)
     assert 0.8 < np.mean(squared) < 1.5
 
 
@@ -134,7 +139,7 @@ def test_the_error_of_the_offset_adds_up_along_a_drive():
 
 def test_too_few_observations_have_no_covariance():
     points, uvr, weight = observations("mixed")
-    few = pose_covariance(TRUTH, points[:2], uvr[:2], weight[:2], CAMERA.intrinsics)
+    few = covariance(TRUTH, points[:2], uvr[:2], weight[:2])
     assert np.isnan(few).all()
 
 

@@ -401,8 +401,8 @@ def test_true_loops_pass_and_help(drift, bias):
         graph = chain_graph(T_wc, loops, measured, reach=3)
         T_cw, verdict = judge(graph)
         assert verdict.consistent, verdict.reason
-        assert verdict.strain < 0.5 * CONFIG.max_strain * max(1, verdict.closed)
-        assert np.isnan(verdict.loop_error).sum() == len(graph.edges) - len(loops)
+        half = CONFIG.model_copy(update={"max_strain": 0.5 * CONFIG.max_strain})
+        assert check_pose_graph(graph, T_cw, half).consistent
         before.append(position_error(graph.T_cw))
         after.append(position_error(T_cw))
     assert np.mean(after) < 0.6 * np.mean(before)
@@ -427,7 +427,6 @@ def test_a_wrong_loop_among_true_ones_is_recognised_and_ignored(metres):
         graph = chain_graph(T_wc, [*loops, (query + 20, match + 20)], [*measured, wrong], reach=3)
         T_cw, verdict = judge(graph)
         assert not verdict.consistent
-        assert np.nanargmax(verdict.loop_error) == len(graph.edges) - 1
         assert f"loop {match + 20}-{query + 20} is contradicted" in verdict.reason
         without, _ = judge(chain_graph(T_wc, loops, measured, reach=3))
         off_by = np.linalg.norm((inverses(T_cw) - inverses(without))[:, :3, 3], axis=1)
@@ -459,8 +458,10 @@ def test_a_part_that_began_anew_is_joined_from_wherever_it_was(metres, yaw):
     jump = T_wc[119] @ turn(yaw) @ translation(0.6 * metres, 0, 0.8 * metres) @ inverse(T_wc[119])
     lost = T_wc.copy()
     lost[120:] = jump @ lost[120:]
-    T_cw, verdict = judge(chain_graph(lost, loops[:1], measured[:1], reach=3, weak=[120]))
+    graph = chain_graph(lost, loops[:1], measured[:1], reach=3, weak=[120])
+    T_cw = optimise(graph, CONFIG)
+    rigid = CONFIG.model_copy(update={"max_strain": 1.0})
+    verdict = check_pose_graph(graph, T_cw, rigid)
     assert verdict.consistent, verdict.reason
-    assert verdict.strain < 1.0
     assert position_error(inverses(lost)) > 2.0
     assert position_error(T_cw) < 1.0

@@ -132,6 +132,16 @@ def test_features_without_depth_are_monocular(corridor):
     assert extracted.pyramid is None  # no pyramid, because matches are not aligned
 
 
+def test_matches_are_not_aligned_if_the_depth_image_cannot_be_read(corridor):
+    def read_depth():
+        raise UnreadableImageError(Path("depth.png"), "cannot be decoded; download it again.")
+
+    context = TrackingContext.create(replace(corridor.camera, depth=True), Config())
+    extracted = FrameImages(corridor.left[0], read_depth, context).extracted
+    assert np.isnan(extracted.features.u_right).all()
+    assert extracted.pyramid is None
+
+
 def test_a_corner_at_an_edge_of_depth_has_none():
     camera = Camera(100.0, 100.0, 20.0, 20.0, 0.5, 40, 40, depth=True)
     depth = np.full((40, 40), 2.0, np.float32)

@@ -167,11 +167,22 @@ def test_many_frames_take_no_more_memory():
     assert len(learned(0.0, frames=400).state().numbers()) < 16 * 12 * 12 + 1000
 
 
-def test_matches_without_a_row_offset_teach_nothing():
+def test_frames_between_keyframes_only_give_the_velocity():
+    found = SideDelay(CAMERA, CONFIG)
+    for k, twist in enumerate(drive(30)):
+        # The velocity falls. At the keyframe, it is the mean of the velocities before and after it.
+        add(found, seen(twist, 5e-3, seed=k)[0], 1.3 * twist)
+        add(found, Extracted.nothing(), 0.7 * twist)
+        add(found, Extracted.nothing(), twist)
+    assert found.seconds == pytest.approx(5e-3, abs=4 * found.sigma)
+    assert 0.0 < found.sigma < 0.3e-3
+
+
+def test_frames_of_unknown_velocity_teach_nothing():
     found = SideDelay(CAMERA, CONFIG)
     for k, twist in enumerate(drive(60)):
         extracted, _ = seen(twist, 5e-3, seed=k)
-        add(found, extracted if k % 2 else Extracted.nothing(), twist)
+        add(found, extracted, twist)
         add(found, extracted, None)
     assert found.sigma == np.inf
 

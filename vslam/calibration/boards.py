@@ -143,7 +143,7 @@ def read_board(path: Path) -> Board:
         raise InputError(
             f"{path}: the target_type {kind} is unknown; use an aprilgrid or a checkerboard."
         )
-    columns, rows = (int(document.number(name)) for name in names)
+    columns, rows = (document.integers(name, 1)[0] for name in names)
     try:
         return Board(cast("Kind", kind), columns, rows, square, marker)
     except InputError as error:
@@ -193,10 +193,14 @@ def other_board(board: Board, images: Sequence[Image]) -> str:
         return ""
     if found.kind == board.kind and found.columns == board.columns:  # some rows may be out of view
         found = replace(found, rows=max(found.rows, board.rows))
-    given, tags = (_dictionary(each.dictionary).bytesList for each in (board, found))
-    # The dictionary of ``board`` is right if it begins with the tags of the recognised dictionary.
-    if found.kind != "charuco" or np.array_equal(given[: len(tags)], tags):
-        found = replace(found, dictionary=board.dictionary)
+    n = (found.columns * found.rows + 1) // 2  # number of markers of a ChArUco board
+    given, tags = (_dictionary(each.dictionary).bytesList[:n] for each in (board, found))
+    # The dictionary of ``board`` is right if it begins with the markers of the recognised board.
+    dictionary = board.dictionary
+    if found.kind == "charuco" and not np.array_equal(given, tags):
+        least = next((size for size in _SIZES if size >= n), _SIZES[-1])
+        dictionary = found.dictionary.replace("_1000", f"_{least}")
+    found = replace(found, dictionary=dictionary)
     ratio = found.marker / found.square
     same_layout = replace(found, square=board.square, marker=board.marker) == board
     if same_layout and abs(board.marker / board.square - ratio) <= _SAME_RATIO * ratio:
@@ -317,7 +321,7 @@ def _recognised_checkerboard(images: Sequence[Image]) -> Board | None:
 
 def _recognised_tags(images: Sequence[Image]) -> Board | None:
     """Recognise a ChArUco board or AprilGrid, using the image that shows the most tags. Its squares
-    are assumed to be 0.1 m wide."""
+    are assumed to be 0.1 m wide. Its dictionary is the largest one of the family."""
     counts = [
         (len(_find_tags(image, *family, _TRIED_TAGS)[0]), image, family)
         for image, family in product(images, _FAMILIES)
@@ -343,7 +347,8 @@ def _layout(
     is in column ``first`` of the first row.
 
     Returns:
-        The number of tags that fit, and the board; 0 and None if too few tags fit.
+        The number of tags that fit, and the board; 0 and None if too few tags fit, or if such a
+        board is impossible.
     """
     step = 2 if kind == "charuco" else 1  # a ChArUco board has a tag on every other square
     squares = np.indices((step * numbers.max() // columns + 2, columns)).sum(axis=0)
@@ -356,8 +361,8 @@ def _layout(
     ratio = float(np.median(np.linalg.norm(tags - np.roll(tags, 1, axis=1), axis=2)))
     if not 0.0 < ratio < 1.0:
         return 0, None
-    if family.endswith("_1000"):
-        least = next(size for size in _SIZES if size > numbers[fits].max())
-        family = family.replace("1000", str(least))
     rows = max(3 if kind == "charuco" else 1, int(at[fits, 1].max()) + 1)
-    return n, Board(kind, columns, rows, 0.1, 0.1 * ratio, family)
+    try:
+        return n, Board(kind, columns, rows, 0.1, 0.1 * ratio, family)
+    except InputError:
+        return 0, None

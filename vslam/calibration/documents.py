@@ -57,6 +57,14 @@ class Document:
     def number(self, key: str) -> float:
         return self._numbers(key, "one number", 1)[0]
 
+    def integers(self, key: str, count: int) -> tuple[int, ...]:
+        """Return the ``count`` integers that are stored under a key."""
+        wanted = "one integer" if count == 1 else f"{count} integers"
+        found = self._numbers(key, wanted, count)
+        if any(number % 1 for number in found):
+            raise InputError(f"{self.source}: {key} must be {wanted}.")
+        return tuple(map(int, found))
+
     def numbers(self, key: str, *counts: int) -> tuple[float, ...]:
         """Return the numbers that are stored under a key, as a flat tuple. If ``counts`` are given,
         its length must be one of them."""

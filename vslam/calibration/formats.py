@@ -310,8 +310,9 @@ def _size_of(document: Document, size: Size | None, *keys: str) -> Size:
     has no such key, ``size`` is returned."""
     if keys[0] not in document and size is not None:
         return size
-    width, height = document.numbers(keys[0], 2) if len(keys) == 1 else map(document.number, keys)
-    return int(width), int(height)
+    each = 2 // len(keys)
+    width, height = (n for key in keys for n in document.integers(key, each))
+    return width, height
 
 
 def _positive(document: Document, key: str) -> float:

@@ -301,4 +301,5 @@ def _check_rigid(name: str, T: NDArray[np.float64]) -> None:
     R = T[:, :3, :3]
     error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0)
     last = np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0)
-    _require(bool(error < _ROTATION_TOLERANCE and last == 0.0), f"{name} is not a rigid motion")
+    rigid = error < _ROTATION_TOLERANCE and last == 0.0 and (np.linalg.det(R) > 0.0).all()
+    _require(bool(rigid), f"{name} is not a rigid motion")

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.maps.reconstruction import PIXEL_CENTRE, Reconstruction
+from vslam.trajectory import quaternions
 
 _CAMERA_ID = 1
 _PINHOLE = 1  # number of this model in COLMAP's camera_models
@@ -78,11 +79,9 @@ def save_colmap(
 
 
 def _images(reconstruction: Reconstruction, names: list[str]) -> Iterator[_Image]:
-    from scipy.spatial.transform import Rotation
-
     r = reconstruction
-    quaternions = Rotation.from_matrix(r.T_cw[:, :3, :3]).as_quat(canonical=True)
-    poses = np.column_stack([quaternions[:, 3], quaternions[:, :3], r.T_cw[:, :3, 3]])
+    xyzw = quaternions(r.T_cw[:, :3, :3])
+    poses = np.column_stack([xyzw[:, 3], xyzw[:, :3], r.T_cw[:, :3, 3]])
     points = np.empty(len(r.xy), _POINT2D)
     points["xy"], points["point"] = r.xy + PIXEL_CENTRE, r.landmark + 1
     for keyframe, (pose, name) in enumerate(zip(poses, names, strict=True)):

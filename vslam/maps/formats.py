@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.maps.reconstruction import PIXEL_CENTRE, Reconstruction
+from vslam.trajectory import quaternions
 
 POINTS = "sparse_pc.ply"
 # The axes of nerfstudio's world frame point right, forward and up, as seen from the first camera.
@@ -113,13 +114,7 @@ def save_g2o(
 
 def _poses(T: NDArray[np.float64]) -> NDArray[np.float64]:
     """Convert poses to an ``(N, 7)`` array of x y z qx qy qz qw, with qw >= 0."""
-    from scipy.spatial.transform import Rotation
-
-    if not len(T):  # SciPy rejects an empty array
-        return np.empty((0, 7))
-    return np.column_stack(
-        [T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)]
-    )
+    return np.column_stack([T[:, :3, 3], quaternions(T[:, :3, :3])])
 
 
 def _words(values: list[float]) -> str:

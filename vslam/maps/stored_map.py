@@ -244,9 +244,9 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
         name: table.followed_by(other.detector.tables[name])
         for name, table in one.detector.tables.items()
     }
-    images = one.images
-    if images is not None and other.images is not None:
-        images = images.followed_by(other.images)
+    images = None
+    if one.images is not None or other.images is not None:
+        images = _images_of(one).followed_by(_images_of(other))
     return StoredMap(
         map=both,
         camera=one.camera,
@@ -257,6 +257,13 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
         thresholds=one.thresholds,
         truth_alignment=one.truth_alignment,
     )
+
+
+def _images_of(stored: StoredMap) -> PerKeyframe:
+    """Return the images of a map. A map without images gets an empty entry for each keyframe."""
+    if stored.images is not None:
+        return stored.images
+    return PerKeyframe(np.zeros(stored.map.n_keyframes + 1, np.int64), np.empty(0, np.uint8))
 
 
 def _spanning_tree(

@@ -373,6 +373,14 @@ def test_train_writes_weights_and_card(tmp_path):
     assert torch.allclose(a, b, atol=2e-2)
 
 
+def test_train_refuses_a_file_as_its_folder_before_it_reads_images(tmp_path):
+    file = tmp_path / "notes.txt"
+    file.write_text("mine")
+    command = ["train", "capsule", "--data", "pairs:nowhere", "--out", str(file)]
+    done = CliRunner().invoke(app, command)
+    assert "notes.txt: cannot be written (Not a directory); give another" in str(done.exception)
+
+
 @pytest.mark.parametrize("name", ["capsule", "capsule-pruned", "capsule-paper"])
 def test_shipped_weights_know_a_place_again(name):
     """The images are moved and darker, but show the same place."""

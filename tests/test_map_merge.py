@@ -270,6 +270,7 @@ def test_refusals(files, tmp_path):
         "map", "crop", files[0], "--point", "900,900", "--within", "5", *out
     )
     assert not (tmp_path / "m.npz").exists()
+    assert "give --no-colours, or the folder" in refusal("export", "ply", files[0])
 
 
 assert LAP > 180  # the drives are parts of one lap

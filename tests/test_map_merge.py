@@ -187,12 +187,15 @@ def refusal(*words: object) -> str:
 
 def test_merge_names_what_meets_and_what_does_not(files, tmp_path):
     out = tmp_path / "town.npz"
-    result = run("map", "merge", files[0], files[3], files[2], "--out", out, "--quiet")
+    result = run("map", "merge", files[0], files[3], files[2], "--out", out)
     assert result.exit_code == 0, result.output
     assert f"{files[2]}: joined by " in result.output
     assert f"{files[3]}: left out" in result.output
     assert load_map(out).drives == ("ring 0", "ring 55")
     assert "drives 2: ring 0, ring 55" in " ".join(run("map", "info", out).output.split())
+    quiet = ("--out", tmp_path / "again.npz", "--quiet")
+    (line,) = run("map", "merge", files[0], files[3], files[2], *quiet).output.splitlines()
+    assert line.startswith(f"{files[3]}: left out")
 
 
 def test_maps_are_merged_with_the_thresholds_of_the_first(drives, tmp_path):

@@ -164,7 +164,8 @@ def synth(
         return
     if clean:
         freed = store.clean(cache, route or None)
-        typer.echo(f"{cache}: {freed / 1e6:.0f} MB removed")
+        if not quiet:
+            typer.echo(f"{cache}: {freed / 1e6:.0f} MB removed")
         return
     if side_by_side is not None and (pairs or fisheye):
         raise InputError("--side-by-side: writes a sequence; leave out --pairs and --fisheye.")
@@ -217,10 +218,13 @@ def synth(
 
         frames = open_kitti(root, drive.name, max_frames=max_frames)
         calibration_file = write_side_by_side(frames, side_by_side)
-        typer.echo(
-            f"{side_by_side}: {counted(len(frames), 'frame')}, calibration in {calibration_file}"
-        )
-    typer.echo(f"{root}: " + (counted(pairs, "pair") if pairs else f"sequence {route}"))
+        if not quiet:
+            typer.echo(
+                f"{side_by_side}: {counted(len(frames), 'frame')}, calibration in "
+                f"{calibration_file}"
+            )
+    if not quiet:
+        typer.echo(f"{root}: " + (counted(pairs, "pair") if pairs else f"sequence {route}"))
 
 
 def _range(option: str, given: str, least: float) -> tuple[float, float]:

@@ -23,7 +23,7 @@ from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.closing import LoopClosing
 from vslam.config import Config, SiameseConfig
-from vslam.errors import InputError
+from vslam.errors import InputError, ResultsError
 from vslam.features import Features
 from vslam.lab.loopbench.detectors import NetworkScorer
 from vslam.loopclosure.reach import beyond_reach
@@ -32,6 +32,7 @@ from vslam.loopclosure.siamese.detector import SiameseDetector, open_detector
 from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
 from vslam.loopclosure.siamese.weights import SHIPPED
+from vslam.loopclosure.training import export
 from vslam.loopclosure.training.export import (
     SIMILARITY_TOLERANCE,
     TOLERANCE,
@@ -326,6 +327,25 @@ def test_onnx_says_what_torch_says(name):
     alike = torch_network.compare(expected[0], expected).numpy()
     alike_here = network.compare(descriptors[0], descriptors)
     assert np.abs(alike_here - alike).max() < SIMILARITY_TOLERANCE
+
+
+@pytest.mark.parametrize("differs", ["itself", "others"])
+def test_export_compares_different_images(tmp_path, monkeypatch, differs):
+    """At distance 0, the square root magnifies rounding, which is no fault of the export."""
+
+    class Rounding(OnnxNetwork):
+        def compare(self, query, gallery):
+            itself = (gallery == query).all(1)
+            return super().compare(query, gallery) + 0.1 * (itself == (differs == "itself"))
+
+    monkeypatch.setattr(export, "OnnxNetwork", Rounding)
+    path = tmp_path / "capsule.onnx"
+    if differs == "itself":
+        export_onnx(small_network(), path)
+    else:
+        with pytest.raises(ResultsError, match=r"similarities by 1\.0e-01"):
+            export_onnx(small_network(), path)
+    assert path.exists() == (differs == "itself")
 
 
 @pytest.mark.slow

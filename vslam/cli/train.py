@@ -180,10 +180,10 @@ def train(
         )  # fmt: skip
     if outcome.weights.exists():
         trained, about = load_network(outcome.weights)
-        export_onnx(trained, outcome.weights.with_suffix(".onnx"), about)
         name = settings.name if settings else preset
         card = describe(trained, collection, chosen, outcome, preset=name, data=data, device=device)
         write_card({**card, **report}, outcome.weights)
+        export_onnx(trained, outcome.weights.with_suffix(".onnx"), about)
     if quiet:
         return
     if not outcome.finished:

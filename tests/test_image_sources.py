@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -206,8 +208,13 @@ def test_sources_together(tmp_path):
 def test_a_pack_is_the_same_data(tmp_path):
     write_kitti_root(tmp_path)
     (source,) = open_source(f"kitti:{tmp_path}")
-    write_pack([source, source], tmp_path / "p.npz", (20, 20), "squash")
-    first, _ = open_source(f"pack:{tmp_path / 'p.npz'}")
+    n = len(source)
+    split = replace(source, is_query=np.arange(n) % 2 == 0, times=np.arange(float(n)))
+    write_pack([source, split], tmp_path / "p.npz", (20, 20), "squash")
+    first, second = open_source(f"pack:{tmp_path / 'p.npz'}")
+    assert first.is_query is None
+    assert np.array_equal(second.is_query, split.is_query)
+    assert np.array_equal(second.times, split.times)
     assert (first.name, first.names) == (source.name, source.names)
     assert np.array_equal(first.relation, source.relation)
     assert np.array_equal(first.unit, source.unit)

@@ -10,9 +10,10 @@ import pytest
 from scipy.io import savemat
 from siamese_worlds import views
 
+from vslam.datasets.image_files import is_image
 from vslam.errors import InputError, UnreadableImageError
 from vslam.geometry import se3_exp
-from vslam.loopclosure.siamese.image_source import read_loop_matrix, undistorted
+from vslam.loopclosure.siamese.image_source import images_in, read_loop_matrix, undistorted
 from vslam.loopclosure.siamese.kitti_source import relation_of_poses
 from vslam.loopclosure.siamese.pack import write_pack
 from vslam.loopclosure.siamese.source_registry import open_source
@@ -176,6 +177,13 @@ def test_photographs_follow_the_kind_in_their_notes(tmp_path):
     (tmp_path / "zoo" / "NOTES.txt").write_text("animals\n")
     with pytest.raises(InputError, match="must state the kind of the set"):
         open_source(f"photos:{tmp_path}")
+
+
+def test_images_of_sources_are_those_of_runs(tmp_path):
+    for name in ("a.bmp", "b.TIF", "c.jpg", "._c.jpg", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert [path.name for path in images_in(tmp_path)] == ["a.bmp", "b.TIF", "c.jpg"]
+    assert images_in(tmp_path) == list(filter(is_image, sorted(tmp_path.iterdir())))
 
 
 def test_rendered_pairs_know_their_own_pairs_only(tmp_path):

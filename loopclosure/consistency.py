@@ -40,7 +40,7 @@ class LoopConsistency:
         self._turn = 0  # number of updates so far
 
     def update(
-        self, keyframe: int, candidates: list[LoopCandidate], map_: Map
+        self, candidates: list[LoopCandidate], map_: Map
     ) -> tuple[list[LoopCandidate], list[LoopEdge]]:
         """Check whether enough consecutive keyframes resembled the place of each candidate.
 

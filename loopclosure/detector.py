@@ -69,19 +69,22 @@ class LoopDetector(Protocol):
 
 
 def require_same(detector: DetectorMemory, memory: DetectorMemory) -> None:
-    """Check that stored data comes from the same detector, with the same vocabulary or weights.
+    """Check that stored data comes from the same detector, with the same vocabulary or weights, and
+    that it has all tables.
 
     Args:
         detector: the result of the detector's method ``memory``.
         memory: the stored data.
 
     Raises:
-        ValueError: the detector, its vocabulary or its weights differ.
+        ValueError: the detector, its vocabulary or its weights differ, or a table is missing.
     """
     if memory.name != detector.name:
         raise ValueError(f"made with the detector {memory.name}, not {detector.name}")
     if memory.fingerprint != detector.fingerprint:
         raise ValueError(f"made with another vocabulary or other weights of {detector.name}")
+    if missing := sorted(detector.tables.keys() - memory.tables.keys()):
+        raise ValueError(f"the data of {detector.name} lacks {', '.join(missing)}")
 
 
 class NoDetector:

@@ -247,7 +247,7 @@ def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
     along the line of sight than across it.
 
     Args:
-        T, scale: initial ``(4, 4)`` motion and scale. ``T`` is overwritten.
+        T, scale: initial ``(4, 4)`` motion and scale.
         a, b: ``ObservedPoints`` of both cameras.
         chosen: ``(M,)`` indices of the matches that are used.
 
@@ -256,6 +256,7 @@ def refine_motion(T, scale, a, b, chosen, intrinsics, iterations, fix_scale):
     """
     points_a, uvr_a, weight_a = a
     points_b, uvr_b, weight_b = b
+    T = T.copy()  # the caller may keep the initial motion as the best one
     p = np.empty(3)
     derivative_a, derivative_b = np.empty((3, 7)), np.empty((3, 7))
     for _ in range(iterations):

@@ -123,7 +123,7 @@ def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationC
     if camera.monocular:
         scale = relative_scale(map_, edge, guided.T_cw, default=edge.scale)
         edge = replace(edge, scale=scale)
-    reason = _rejection_reason(map_, edge, guided, T_query_match, camera, config)
+    reason = _rejection_reason(map_, edge, guided, camera, config)
     return replace(edge, accepted=not reason, reason=reason or "verified")
 
 
@@ -287,16 +287,16 @@ def _rejection_reason(
     map_: Map,
     edge: LoopEdge,
     guided: GuidedMatches,
-    T_query_match: Matrix,
     camera: Camera,
     config: VerificationConfig,
 ) -> str:
     """Return the reason to reject a loop, or "" if it passes all tests."""
+    assert edge.T_query_match is not None
     if edge.n_inliers < config.min_inliers:
         return f"only {edge.n_inliers} landmarks of the place fit"
     if edge.n_inliers < config.min_inlier_ratio * edge.n_matches:
         return f"only {edge.n_inliers} of {edge.n_matches} matches fit"
-    distance = float(np.linalg.norm(inverse(T_query_match)[:3, 3]))
+    distance = float(np.linalg.norm(inverse(edge.T_query_match)[:3, 3]))
     if distance > config.max_distance:
         return f"the pose is {distance:.0f} m from the place"
     if reason := spread_reason(guided.uv, guided.seen, camera, config, config.min_elsewhere):
@@ -304,9 +304,7 @@ def _rejection_reason(
     seen, total = seen_of(map_, edge.match, guided)
     if seen < config.min_seen_ratio * total:
         return f"only {seen} of {total} landmarks of the place are seen"
-    seen, total = seen_of(
-        map_, edge.query, reverse_match(map_, edge, T_query_match, camera, config)
-    )
+    seen, total = seen_of(map_, edge.query, reverse_match(map_, edge, camera, config))
     if seen < config.min_seen_ratio * total:
         return f"only {seen} of {total} landmarks of the query are seen from the place"
     return ""
@@ -339,12 +337,12 @@ def spread_reason(
 def reverse_match(
     map_: Map,
     edge: LoopEdge,
-    T_query_match: Matrix,
     camera: Camera,
     config: VerificationConfig,
 ) -> GuidedMatches:
     """Search for the landmarks of a loop's query keyframe in the image of its match keyframe."""
-    T_match_query = inverse(T_query_match)
+    assert edge.T_query_match is not None
+    T_match_query = inverse(edge.T_query_match)
     T_match_query[:3, 3] *= edge.scale  # lengths in the unit around the query, like the landmarks
     T_mw = T_match_query @ map_.keyframe_pose(edge.query)
     return guided_match(map_, edge.match, map_.landmarks_of(edge.query), T_mw, camera, config)

@@ -23,7 +23,7 @@ from vslam import machine
 from vslam.cli import main as cli
 from vslam.cli import options, train
 from vslam.cli import run as run_command
-from vslam.datasets import open_sequence
+from vslam.datasets import open_sequence, png
 from vslam.features import TrackingState, TrackResult
 from vslam.loopclosure.registry import DETECTORS
 from vslam.loopclosure.siamese.weights import NETWORKS
@@ -726,6 +726,14 @@ def test_info(call, root):
     code, out, _ = call("info", "--data", "nowhere")
     assert code == 0
     assert "nowhere: holds no KITTI odometry data" in out
+
+
+@pytest.mark.skipif("NUMBA_CACHE_DIR" in os.environ, reason="kernels are cached elsewhere")
+def test_info_lists_the_compiled_kernels_of_subfolders(call):
+    encoded = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1]
+    assert png.decode_png(encoded.tobytes()) is not None  # compiles the kernels of the folder
+    folder = Path(png.__file__).parent / "__pycache__"
+    assert f"{folder}: " in call("info", "--data", "nowhere")[1]
 
 
 def test_two_opencv_wheels_are_noticed():

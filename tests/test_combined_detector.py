@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_siamese_detector import a_map
@@ -53,6 +55,13 @@ def test_both_remembers_by_words_and_by_looks():
     both.add(0, image, Features.none())
     (found,) = both.locate(image, Features.none(), a_map(1))
     assert (found.match, found.score) == (0, pytest.approx(1.0, abs=0.1))
+
+
+@pytest.mark.parametrize("name", ["bow", "capsule", "both"])
+def test_a_memory_without_tables_is_refused(name):
+    detector = create_detector(name, Config())
+    with pytest.raises(ValueError, match=f"the data of {name} lacks "):
+        detector.restore(replace(detector.memory(), tables={}))
 
 
 def test_only_detectors_with_a_network_keep_images():

@@ -53,7 +53,7 @@ def verified(query: int, match: int, error=(0.0, 0.0, 0.0), turn: float = 0.0) -
 def test_a_place_must_resemble_three_keyframes_in_a_row():
     consistency = LoopConsistency(STRICT)
     for turn, query in enumerate((110, 111, 112, 113)):
-        consistent, rejected = consistency.update(query, candidates(query, 10 + turn), STREET)
+        consistent, rejected = consistency.update(candidates(query, 10 + turn), STREET)
         assert len(consistent) == (turn >= 2)
         assert [edge.reason for edge in rejected] == (
             []
@@ -66,7 +66,7 @@ def test_a_place_must_resemble_three_keyframes_in_a_row():
 def test_places_that_jump_are_not_consistent():
     consistency = LoopConsistency(STRICT)
     for query, match in ((110, 10), (111, 40), (112, 70), (113, 10), (114, 40)):
-        consistent, rejected = consistency.update(query, candidates(query, match), STREET)
+        consistent, rejected = consistency.update(candidates(query, match), STREET)
         assert consistent == []
         assert rejected[0].match == match
 
@@ -74,22 +74,20 @@ def test_places_that_jump_are_not_consistent():
 @pytest.mark.parametrize(("gap", "still"), [(0, False), (1, True)])
 def test_a_keyframe_without_candidates_in_between(gap, still):
     consistency = LoopConsistency(STRICT.model_copy(update={"max_gap": gap}))
-    consistency.update(110, candidates(110, 10), STREET)
-    consistency.update(111, candidates(111, 11), STREET)
-    consistency.update(112, [], STREET)
-    consistent, _ = consistency.update(113, candidates(113, 13), STREET)
+    consistency.update(candidates(110, 10), STREET)
+    consistency.update(candidates(111, 11), STREET)
+    consistency.update([], STREET)
+    consistent, _ = consistency.update(candidates(113, 13), STREET)
     assert bool(consistent) == still
-    consistency.update(114, [], STREET)
-    consistency.update(115, [], STREET)
-    assert consistency.update(116, candidates(116, 16), STREET)[0] == []
+    consistency.update([], STREET)
+    consistency.update([], STREET)
+    assert consistency.update(candidates(116, 16), STREET)[0] == []
 
 
 def test_only_the_consistent_one_of_several_candidates_passes():
     consistency = LoopConsistency(STRICT)
     for query, other in ((110, 50), (111, 70), (112, 90)):
-        consistent, rejected = consistency.update(
-            query, candidates(query, other, query - 100), STREET
-        )
+        consistent, rejected = consistency.update(candidates(query, other, query - 100), STREET)
     assert [c.match for c in consistent] == [12]
     assert [e.match for e in rejected] == [90]
 
@@ -99,17 +97,17 @@ def test_overlapping_groups_do_not_multiply():
     consistency = LoopConsistency(ConsistencyConfig(min_keyframes=3, max_gap=2))
     for query in range(110, 140):
         matches = [20 + (query + i) % 10 for i in range(10)]
-        consistency.update(query, candidates(query, *matches), STREET)
+        consistency.update(candidates(query, *matches), STREET)
         assert len(consistency.state().places) <= 10
     for query in range(140, 170):  # groups that are not continued are forgotten
         apart = [1000 * query + 20 * i for i in range(10)]
-        consistency.update(query, candidates(query, *apart), STREET)
+        consistency.update(candidates(query, *apart), STREET)
         assert len(consistency.state().places) <= 30
 
 
 def test_the_same_group_twice_counts_once():
     consistency = LoopConsistency(STRICT)
-    consistent, rejected = consistency.update(110, candidates(110, 10, 10, 10, 11), STREET)
+    consistent, rejected = consistency.update(candidates(110, 10, 10, 10, 11), STREET)
     assert consistent == []
     assert len(rejected) == 4
     assert len(consistency.state().places) == 2
@@ -126,12 +124,12 @@ def test_the_drift_of_a_true_edge_is_undone():
 
 def test_two_true_edges_confirm_each_other():
     consistency = LoopConsistency(ConsistencyConfig())
-    consistency.update(110, [], STREET)
+    consistency.update([], STREET)
     first = consistency.confirm(verified(110, 10, (0.05, 0.02, 0.1), 0.05), STREET)
     assert not first.accepted
     assert first.reason == "verified by 1 of 2 keyframes"
     assert first.T_query_match is not None
-    consistency.update(111, [], STREET)
+    consistency.update([], STREET)
     second = consistency.confirm(verified(111, 12, (-0.05, 0.0, 0.05), -0.05), STREET)
     assert second.accepted
     assert second.reason == "verified"
@@ -142,17 +140,17 @@ def test_two_true_edges_confirm_each_other():
 )
 def test_edges_that_disagree_do_not(wrong):
     consistency = LoopConsistency(ConsistencyConfig())
-    consistency.update(110, [], STREET)
+    consistency.update([], STREET)
     consistency.confirm(verified(110, 10, **wrong), STREET)
-    consistency.update(111, [], STREET)
+    consistency.update([], STREET)
     assert not consistency.confirm(verified(111, 11), STREET).accepted
-    consistency.update(112, [], STREET)
+    consistency.update([], STREET)
     assert consistency.confirm(verified(112, 12), STREET).accepted  # the true loops are kept
 
 
 def test_one_keyframe_cannot_confirm_itself():
     consistency = LoopConsistency(ConsistencyConfig())
-    consistency.update(110, [], STREET)
+    consistency.update([], STREET)
     for match in (9, 10, 11):
         assert not consistency.confirm(verified(110, match), STREET).accepted
 
@@ -161,23 +159,23 @@ def test_verified_edges_are_forgotten_in_time_and_at_a_reset():
     config = ConsistencyConfig(verified_memory=3)
     for forgets in ("time", "reset"):
         consistency = LoopConsistency(config)
-        consistency.update(110, [], STREET)
+        consistency.update([], STREET)
         consistency.confirm(verified(110, 10), STREET)
         if forgets == "time":
-            for query in range(111, 115):
-                consistency.update(query, [], STREET)
+            for _ in range(4):
+                consistency.update([], STREET)
         else:
             consistency.reset()
-            consistency.update(111, [], STREET)
+            consistency.update([], STREET)
         assert not consistency.confirm(verified(114, 14), STREET).accepted
 
 
 def test_a_rejected_edge_stays_rejected_and_counts_for_nothing():
     consistency = LoopConsistency(ConsistencyConfig())
-    consistency.update(110, [], STREET)
+    consistency.update([], STREET)
     rejected = LoopEdge(110, 10, 0.5, False, "only 3 descriptors match")
     assert consistency.confirm(rejected, STREET) is rejected
-    consistency.update(111, [], STREET)
+    consistency.update([], STREET)
     assert not consistency.confirm(verified(111, 11), STREET).accepted
 
 
@@ -188,7 +186,7 @@ def test_a_revisit_of_twenty_metres_is_closed_within_it():
     for turn in range(7):
         query = 110 + turn
         found = candidates(query, 10 + turn) if turn % 2 == 0 else []
-        consistent, _ = consistency.update(query, found, STREET)
+        consistent, _ = consistency.update(found, STREET)
         for candidate in consistent:
             if consistency.confirm(verified(query, candidate.match), STREET).accepted:
                 closed_at = 3 * turn

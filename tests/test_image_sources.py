@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from scipy.io import savemat
 from siamese_worlds import views
 
+from vslam.datasets.image_files import is_image
 from vslam.errors import InputError, UnreadableImageError
 from vslam.geometry import se3_exp
-from vslam.loopclosure.siamese.image_source import read_loop_matrix, undistorted
+from vslam.loopclosure.siamese.image_source import images_in, read_loop_matrix, undistorted
 from vslam.loopclosure.siamese.kitti_source import relation_of_poses
 from vslam.loopclosure.siamese.pack import write_pack
 from vslam.loopclosure.siamese.source_registry import open_source
@@ -71,12 +74,16 @@ def test_kitti_takes_frames_by_number(tmp_path):
         ("kitti:{}[seq=00,first=900,last=990]", "no images numbered 900 to 990"),
         ("kitti:{}[seq=00,from=1]", "unknown option 'from'"),
         ("kitti:{}[first=x]", "not a number"),
+        ("kitti:{}[every,first=3]", "'every' has no value; write every=VALUE"),
+        ("kitti:{}[every=0]", "every=0: must be at least 1"),
+        ("kitti:{}[frames=5]", "frames=5: must be ranges, such as 0-249"),
         ("kitti:{}[seq=00,first=0,last=5,near=25]", "near=25: must be above 0 and below 25 m"),
         ("kitti:{}[seq=00,first=0,last=5,near=nan]", "near=nan: must be above 0"),
         ("films:{}", "where KIND is one of"),
         ("pairs:{}", r"pairs\.csv: missing or not a list of pairs"),
         ("photos:{}", "no set of photographs"),
         ("fabmap:{}", "no images"),
+        ("fabmap:{}[side=Right]", "side=Right: must be left or right"),
         ("pack:{}/none.npz", "not a pack of places"),
     ],
 )
@@ -172,6 +179,13 @@ def test_photographs_follow_the_kind_in_their_notes(tmp_path):
         open_source(f"photos:{tmp_path}")
 
 
+def test_images_of_sources_are_those_of_runs(tmp_path):
+    for name in ("a.bmp", "b.TIF", "c.jpg", "._c.jpg", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert [path.name for path in images_in(tmp_path)] == ["a.bmp", "b.TIF", "c.jpg"]
+    assert images_in(tmp_path) == list(filter(is_image, sorted(tmp_path.iterdir())))
+
+
 def test_rendered_pairs_know_their_own_pairs_only(tmp_path):
     for name in ("0a", "0b", "1a", "1b"):
         write_image(tmp_path / "images" / f"{name}.png")
@@ -202,8 +216,13 @@ def test_sources_together(tmp_path):
 def test_a_pack_is_the_same_data(tmp_path):
     write_kitti_root(tmp_path)
     (source,) = open_source(f"kitti:{tmp_path}")
-    write_pack([source, source], tmp_path / "p.npz", (20, 20), "squash")
-    first, _ = open_source(f"pack:{tmp_path / 'p.npz'}")
+    n = len(source)
+    split = replace(source, is_query=np.arange(n) % 2 == 0, times=np.arange(float(n)))
+    write_pack([source, split], tmp_path / "p.npz", (20, 20), "squash")
+    first, second = open_source(f"pack:{tmp_path / 'p.npz'}")
+    assert first.is_query is None
+    assert np.array_equal(second.is_query, split.is_query)
+    assert np.array_equal(second.times, split.times)
     assert (first.name, first.names) == (source.name, source.names)
     assert np.array_equal(first.relation, source.relation)
     assert np.array_equal(first.unit, source.unit)

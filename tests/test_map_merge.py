@@ -211,12 +211,15 @@ def refusal(*words: object) -> str:
 
 def test_merge_names_what_meets_and_what_does_not(files, tmp_path):
     out = tmp_path / "town.npz"
-    result = run("map", "merge", files[0], files[3], files[2], "--out", out, "--quiet")
+    result = run("map", "merge", files[0], files[3], files[2], "--out", out)
     assert result.exit_code == 0, result.output
     assert f"{files[2]}: joined by " in result.output
     assert f"{files[3]}: left out" in result.output
     assert load_map(out).drives == ("ring 0", "ring 55")
     assert "drives 2: ring 0, ring 55" in " ".join(run("map", "info", out).output.split())
+    quiet = ("--out", tmp_path / "again.npz", "--quiet")
+    (line,) = run("map", "merge", files[0], files[3], files[2], *quiet).output.splitlines()
+    assert line.startswith(f"{files[3]}: left out")
 
 
 def test_maps_are_merged_with_the_thresholds_of_the_first(drives, tmp_path):
@@ -294,6 +297,7 @@ def test_refusals(files, tmp_path):
         "map", "crop", files[0], "--point", "900,900", "--within", "5", *out
     )
     assert not (tmp_path / "m.npz").exists()
+    assert "give --no-colours, or the folder" in refusal("export", "ply", files[0])
 
 
 assert LAP > 180  # the drives are parts of one lap

@@ -134,6 +134,7 @@ def test_terminal():
     ]  # fmt: skip
     assert lines[11:15] == ["", "Medians.", "- bow wins", "- chance"]
     assert "sensor  stereo" in lines
+    assert lines[-3:] == ["Folded", "", "A sentence."]  # the explorer is not for a terminal
 
 
 def test_a_narrow_terminal_folds_sentences_and_never_a_table():

@@ -23,7 +23,7 @@ from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.closing import LoopClosing
 from vslam.config import Config, SiameseConfig
-from vslam.errors import InputError
+from vslam.errors import InputError, ResultsError
 from vslam.features import Features
 from vslam.lab.loopbench.detectors import NetworkScorer
 from vslam.loopclosure.reach import beyond_reach
@@ -32,6 +32,7 @@ from vslam.loopclosure.siamese.detector import SiameseDetector, open_detector
 from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
 from vslam.loopclosure.siamese.weights import SHIPPED
+from vslam.loopclosure.training import export
 from vslam.loopclosure.training.export import (
     SIMILARITY_TOLERANCE,
     TOLERANCE,
@@ -328,6 +329,25 @@ def test_onnx_says_what_torch_says(name):
     assert np.abs(alike_here - alike).max() < SIMILARITY_TOLERANCE
 
 
+@pytest.mark.parametrize("differs", ["itself", "others"])
+def test_export_compares_different_images(tmp_path, monkeypatch, differs):
+    """At distance 0, the square root magnifies rounding, which is no fault of the export."""
+
+    class Rounding(OnnxNetwork):
+        def compare(self, query, gallery):
+            itself = (gallery == query).all(1)
+            return super().compare(query, gallery) + 0.1 * (itself == (differs == "itself"))
+
+    monkeypatch.setattr(export, "OnnxNetwork", Rounding)
+    path = tmp_path / "capsule.onnx"
+    if differs == "itself":
+        export_onnx(small_network(), path)
+    else:
+        with pytest.raises(ResultsError, match=r"similarities by 1\.0e-01"):
+            export_onnx(small_network(), path)
+    assert path.exists() == (differs == "itself")
+
+
 @pytest.mark.slow
 def test_train_writes_weights_and_card(tmp_path):
     data = tmp_path / "pairs"
@@ -371,6 +391,14 @@ def test_train_writes_weights_and_card(tmp_path):
     with torch.no_grad():
         a, b = (load_network(path)[0].eval().embed(x) for path in (full, shipped))
     assert torch.allclose(a, b, atol=2e-2)
+
+
+def test_train_refuses_a_file_as_its_folder_before_it_reads_images(tmp_path):
+    file = tmp_path / "notes.txt"
+    file.write_text("mine")
+    command = ["train", "capsule", "--data", "pairs:nowhere", "--out", str(file)]
+    done = CliRunner().invoke(app, command)
+    assert "notes.txt: cannot be written (Not a directory); give another" in str(done.exception)
 
 
 @pytest.mark.parametrize("name", ["capsule", "capsule-pruned", "capsule-paper"])

@@ -8,7 +8,13 @@ from stereo_noise import white_noise
 
 from vslam.camera import Camera
 from vslam.geometry import inverse, se3_exp, se3_log, symmetric_eigen, transform
-from vslam.loopclosure.sim3_ransac import ObservedPoints, align, fit_motion, is_degenerate
+from vslam.loopclosure.sim3_ransac import (
+    ObservedPoints,
+    align,
+    fit_motion,
+    is_degenerate,
+    refine_motion,
+)
 from vslam.ransac import draw_three, draws_needed, random_index
 
 CAMERA = Camera(718.0, 718.0, 607.0, 185.0, 0.54, 1241, 376)
@@ -119,6 +125,15 @@ def test_scale_is_found_from_monocular_maps(n, outliers):
         assert np.count_nonzero(found.inlier[wrong]) == 0
         assert errors(found.T_a_b, T)[1] < 0.2
         assert align(a, b, CAMERA.intrinsics, seed=seed, **SETTINGS) is None  # not rigid
+
+
+def test_a_refinement_does_not_change_the_initial_motion():
+    _, a, b, _ = scene(0, 40, 0.0, scale=2.5)
+    T, scale = fit_motion(a.points, b.points, np.ones(40), False)
+    before = T.copy()
+    _, refined = refine_motion(T, scale, a, b, np.arange(40), CAMERA.intrinsics, 5, False)
+    assert refined != scale
+    np.testing.assert_array_equal(T, before)
 
 
 def test_chance_matches_have_no_consensus():

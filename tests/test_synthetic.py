@@ -620,11 +620,22 @@ def test_a_name_says_how_the_town_varies():
 @pytest.mark.slow
 def test_a_drive_with_a_name_of_its_own_is_that_route_in_that_town(tmp_path, monkeypatch):
     monkeypatch.setenv("VSLAM_CACHE", str(tmp_path))
-    words = ["synth", "night", "--max-frames", "1", "--quiet"]
+    words = ["synth", "night", "--max-frames", "1"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     folder = tmp_path / "synthetic" / "v2-seed1-change1"
-    assert done.output.startswith(f"{folder}: ")
+    assert done.stdout.startswith(f"{folder}: ")
+    assert CliRunner().invoke(app, [*words, "--quiet"]).output == ""
     assert [path.name for path in (folder / "sequences").iterdir()] == ["lane"]
     found = open_sequence("synthetic", None, "night", max_frames=1)
     assert (found.name, found.dataset, len(found)) == ("night", "synthetic", 1)
+
+
+@pytest.mark.parametrize("pairs", [[], ["--pairs", "2"]])
+@pytest.mark.parametrize(
+    ("option", "why"), [("--lateral=0:20", "from -4 to 4"), ("--heading=x", "must be LOW:HIGH")]
+)
+def test_moves_beyond_the_road_are_refused_before_rendering(tmp_path, pairs, option, why):
+    words = ["synth", "demo", *pairs, option, "--out", str(tmp_path / "out")]
+    assert why in str(CliRunner().invoke(app, words).exception)
+    assert not (tmp_path / "out").exists()

@@ -182,6 +182,7 @@ def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
     train(collection, small_settings(epochs=1), tmp_path, threads=1)
     with pytest.raises(InputError, match="other settings"):
         train(collection, small_settings(seed=1), tmp_path, threads=1, resume=True)
+    assert load_settings(tmp_path / "settings.json") == small_settings(epochs=1)
     (tmp_path / CHECKPOINT).write_bytes(b"cut off")
     with pytest.raises(InputError, match="not a readable checkpoint"):
         train(collection, small_settings(), tmp_path, threads=1, resume=True)

@@ -210,7 +210,7 @@ def test_every_gate_says_what_it_missed(change, reason):
 def test_both_sides_of_a_revisit_see_each_other():
     world = street()
     edge = check(world)
-    found = reverse_match(world.map, edge, edge.T_query_match, CAMERA, CONFIG)
+    found = reverse_match(world.map, edge, CAMERA, CONFIG)
     assert np.mean(found.seen) > 0.7
     np.testing.assert_allclose(
         found.T_cw @ inverse(world.map.keyframe_pose(6)), inverse(edge.T_query_match), atol=0.03

@@ -418,9 +418,10 @@ def test_commands_train_convert_and_show(call, tmp_path):
         image = cv2.resize(rng.integers(0, 256, (40, 60), dtype=np.uint8), (240, 160))
         cv2.imwrite(str(tmp_path / folder / f"{k}.png"), image)
     (tmp_path / "photos" / "broken.jpg").write_text("no image")
-    code, out, err = call("train", "photos", "*.png", "--k", 4, "--levels", 3, "--quiet")
+    code, out, err = call("train", "photos", "*.png", "--k", 4, "--levels", 3)
     assert code == 0, err
     assert "of 3 images, k 4, levels 3, seed 0" in out
+    assert call("train", "photos", "--k", 4, "--levels", 3, "--quiet", "--out", "q.npz")[1] == ""
     assert "photos/broken.jpg: cannot be read as an image; skipped" in err
     assert call("convert", "vocabulary.npz", "v.txt")[0] == 0
     assert call("convert", "v.txt", "back.npz")[0] == 0

@@ -111,7 +111,7 @@ class LoopClosing:
     def _find(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> LoopSearch:
         """Verify loop candidates, best first, until a candidate passes. The map is only read."""
         candidates = self.verifier.rate(map_, keyframe, candidates)
-        _, rejected = self._consistency.update(keyframe, candidates, map_)
+        _, rejected = self._consistency.update(candidates, map_)
         rejections = {edge.match: edge for edge in rejected}
         tried = [one for one in candidates if one.promising or one.match not in rejections]
         matches = {one.match for one in tried}

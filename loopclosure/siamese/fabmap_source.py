@@ -35,9 +35,11 @@ def read_fabmap(folder: Path, truth: str = "", side: str = "left") -> list[Image
             pair.
 
     Raises:
-        InputError: there are no images or no matrix, or the number of rows does not match the
-            number of images.
+        InputError: there are no images or no matrix, the number of rows does not match the number
+            of images, or ``side`` is neither "left" nor "right".
     """
+    if side not in ("left", "right"):
+        raise InputError(f"side={side}: must be left or right.")
     files = images_in(folder)
     if not files:
         raise InputError(f"{folder}: no images; see docs/reference/datasets.md.")

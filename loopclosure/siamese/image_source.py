@@ -14,7 +14,8 @@ from vslam.errors import InputError
 from vslam.loopclosure.siamese.images import Fit, Size, read_grey, to_size
 
 SAME, UNKNOWN, DIFFERENT = 1, 0, -1
-_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".ppm", ".pgm"}
+# The same files as for runs (vslam.datasets.image_files, which this package may not import).
+_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 _NO_TRUTH = (
     "{}: contains no ground truth (a square matrix with at least one match); give the loop matrix "
     "of these images."
@@ -93,11 +94,11 @@ def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> N
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Return the image files of a folder, sorted by name. The list is empty if there is no such
-    folder."""
+    """Return the image files of a folder, sorted by name, without hidden files. The list is empty
+    if there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES and p.name[0] != ".")
 
 
 def names_of(files: Iterable[Path]) -> tuple[str, ...]:

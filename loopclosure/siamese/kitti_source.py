@@ -5,6 +5,7 @@ The poses of the sequence, or a loop matrix, determine which images show the sam
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,9 +53,14 @@ def read_kitti(
             loop matrices also mark pairs of images that are 20 m or more apart.
 
     Raises:
-        InputError: the range contains no images, images have no poses, ``near`` is out of range, or
-            the matrix or the times do not belong to the sequence.
+        InputError: the range contains no images, images have no poses, ``every``, ``frames`` or
+            ``near`` is out of range or malformed, or the matrix or the times do not belong to the
+            sequence.
     """
+    if int(every) < 1:
+        raise InputError(f"every={every}: must be at least 1.")
+    if frames and not re.fullmatch(r"\d+-\d+(\+\d+-\d+)*", frames):
+        raise InputError(f"frames={frames}: must be ranges, such as 0-249+1500-1699.")
     base = root if (root / "sequences").is_dir() else root / "dataset"
     folder = base / "sequences" / seq / "image_0"
     spans = [span.split("-") for span in frames.split("+")] if frames else [[first, last]]

@@ -32,6 +32,10 @@ def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> 
         arrays[f"{k}_sizes"] = np.array([len(e) for e in encoded])
         arrays[f"{k}_bytes"] = np.concatenate([e.ravel() for e in encoded])
         arrays[f"{k}_relation"], arrays[f"{k}_unit"] = source.relation, source.unit
+        if source.is_query is not None:
+            arrays[f"{k}_is_query"] = source.is_query
+        if source.times is not None:
+            arrays[f"{k}_times"] = source.times
     content = io.BytesIO()
     np.savez_compressed(content, **arrays)  # type: ignore[arg-type]
     write_file(path, content.getvalue())
@@ -51,7 +55,14 @@ def read_pack(path: Path) -> list[ImageSource]:
             ends = np.cumsum(content[f"{k}_sizes"])[:-1]
             images = tuple(np.split(content[f"{k}_bytes"], ends))
             relation, unit = content[f"{k}_relation"], content[f"{k}_unit"]
-            sources.append(ImageSource(name, family, tuple(names), images, relation, unit))
+            # Only some sources have these, and packs of earlier versions have neither.
+            is_query, times = content.get(f"{k}_is_query"), content.get(f"{k}_times")
+            sources.append(
+                ImageSource(
+                    name, family, tuple(names), images, relation, unit,
+                    is_query=is_query, times=times,
+                )
+            )  # fmt: skip
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(
             f"{path}: not a pack of places; write it with 'vslam export places'."

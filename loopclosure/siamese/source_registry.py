@@ -55,13 +55,22 @@ _READERS: dict[str, tuple[Callable[..., list[ImageSource]], tuple[str, ...]]] = 
 
 def split_spec(spec: str) -> tuple[str, str, dict[str, str]]:
     """Split ``kind:path[key=value,...]`` into kind, path and options. The path is empty if the text
-    does not have this form."""
+    does not have this form.
+
+    Raises:
+        InputError: an option has no value.
+    """
     kind, _, rest = spec.partition(":")
     found = re.fullmatch(r"(.+?)(?:\[(.*)\])?", rest)
     if found is None:
         return kind, "", {}
-    items = (item.split("=", 1) for item in (found[2] or "").split(",") if "=" in item)
-    return kind, found[1], dict(items)
+    options = {}
+    for item in filter(None, (found[2] or "").split(",")):
+        key, equals, value = item.partition("=")
+        if not equals:
+            raise InputError(f"--data {spec}: the option '{key}' has no value; write {key}=VALUE.")
+        options[key] = value
+    return kind, found[1], options
 
 
 def open_source(spec: str) -> list[ImageSource]:

@@ -30,12 +30,6 @@ def squash(s: Tensor) -> Tensor:
     return s * (torch.sqrt(squared + TINY) / (1.0 + squared))
 
 
-def length(v: Tensor) -> Tensor:
-    """Compute the L2 norm along the last axis (equation 9 of Zhou and Sun). Its gradient at 0 is
-    finite."""
-    return torch.sqrt((v * v).sum(-1) + TINY)
-
-
 def route(
     u: Tensor, W: Tensor, iterations: int = 3, over: Over = "primary", alive: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:

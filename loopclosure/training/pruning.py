@@ -56,16 +56,6 @@ def lowest(activity: Tensor, fraction: float = 0.2) -> Tensor:
     return out.scatter_(1, order[:, :dropped], True)
 
 
-def masked(network: SiameseNetwork, drop: Tensor) -> SiameseNetwork:
-    """Copy a network and mask the primary capsules ``drop``, ``(T, K)`` bool, in the copy. Masked
-    capsules are ignored, but still computed."""
-    copied = copy.deepcopy(network)
-    layer = copied.branch.capsules
-    layer.alive.copy_(~drop.flatten())
-    layer.masked = True
-    return copied
-
-
 def pruned(network: SiameseNetwork, drop: Tensor, name: str = "capsule-pruned") -> SiameseNetwork:
     """Copy a network without the primary capsules ``drop``, ``(T, K)`` bool. The number of removed
     capsules must be the same for each type.

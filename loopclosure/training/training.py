@@ -100,8 +100,8 @@ def train(
     on_step: OnStep | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> TrainingOutcome:
-    """Train a Siamese network, and write its weights, a log, the lists of image pairs and
-    checkpoints to a folder.
+    """Train a Siamese network, and write its weights, the settings, a log, the lists of image pairs
+    and checkpoints to a folder.
 
     Args:
         folder: output folder. The weights are written to ``<settings.network>.safetensors``.
@@ -139,6 +139,8 @@ def train(
         progress, pairs = load_checkpoint(checkpoint, settings, network, optimiser)
     else:  # a good checkpoint then exists even if the first steps diverge
         save_checkpoint(checkpoint, settings, network, optimiser, progress, None)
+    # Written only now, because a checkpoint with other settings is refused.
+    write_file(folder / "settings.json", settings.model_dump_json(indent=1) + "\n")
     last_saved = time.monotonic()
     with ThreadPoolExecutor(threads) as pool:
         run = _Training(

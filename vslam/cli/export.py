@@ -119,7 +119,12 @@ def ply(
     from vslam.maps.formats import landmark_colours, save_ply
     from vslam.maps.new_output import new_output
 
-    if run.is_file() and not colours:
+    if run.is_file():
+        if colours:
+            raise InputError(
+                f"{run}: a map file gives no images for the colours; give --no-colours, or "
+                "the folder of a run."
+            )
         reconstruction = _reconstruction_of_file(run)
     else:
         finished, reconstruction = _read(run)

@@ -67,7 +67,8 @@ def _numba_caches() -> dict[Path, int]:
     import vslam.loopclosure
 
     packages = (vslam, vslam.frontend, vslam.loopclosure, vslam.backend)
-    folders = [Path(next(iter(package.__path__))) / "__pycache__" for package in packages]
+    roots = [Path(next(iter(package.__path__))) for package in packages]
+    folders = [folder for root in roots for folder in sorted(root.rglob("__pycache__"))]
     folders.append(Path(platformdirs.user_cache_dir("numba", appauthor=False)))
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         folders.append(Path(chosen))

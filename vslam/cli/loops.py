@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -20,6 +19,7 @@ from vslam.cli.options import (
     Weights,
     names_in,
     option,
+    require_writable,
 )
 from vslam.errors import InputError, counted
 
@@ -111,7 +111,7 @@ def bench(
     if protocol == "retrieval" and window != WINDOW:
         raise InputError("--window: only for --protocol online; add it, or leave out --window.")
 
-    _require_writable(out)
+    require_writable(out)
     from vslam.cli.console import Console
     from vslam.datasets.synthetic import store
     from vslam.lab.loopbench.cost import cost
@@ -161,17 +161,6 @@ def bench(
         done = f"{counted(len(sets), 'set')} of images"
     if not quiet:
         typer.echo(f"{out / 'loops.html'}: {counted(len(names), 'detector')} on {done}")
-
-
-def _require_writable(out: Path) -> None:
-    try:
-        there = next(path for path in (out, *out.absolute().parents) if path.exists())
-        with TemporaryFile(dir=there):
-            pass
-    except OSError as error:
-        raise InputError(
-            f"{out}: cannot be written ({error.strerror}); give another folder with --out."
-        ) from error
 
 
 def _write(out: Path, seed: int, **found: object) -> None:

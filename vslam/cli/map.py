@@ -163,14 +163,15 @@ def merge(
             merged = merge_maps(stored, thresholds, create, advance)
     except ValueError as error:
         raise InputError(f"{files[0]} and the others cannot be merged: {error}.") from error
-    for number in merged.joined:
-        typer.echo(f"{files[number]}: joined by {counted(len(merged.loops[number]), 'loop')}")
+    if not quiet:
+        for number in merged.joined:
+            typer.echo(f"{files[number]}: joined by {counted(len(merged.loops[number]), 'loop')}")
     for number in merged.left_out:
         typer.echo(f"{files[number]}: left out, because it has no verified loop to the others")
     if not merged.joined:
         typer.echo("no map has a loop to the first one; nothing was written")
         raise typer.Exit(1)
-    _save(out, merged.stored)
+    _save(out, merged.stored, quiet=quiet)
 
 
 def _thresholds_of(stored: list[StoredMap], files: list[Path]) -> Config:
@@ -270,12 +271,13 @@ def _require_place(out: Path) -> None:
     require_place(out, "--out")
 
 
-def _save(out: Path, stored: StoredMap) -> None:
+def _save(out: Path, stored: StoredMap, *, quiet: bool = False) -> None:
     from vslam.maps.new_output import new_output
     from vslam.maps.storage import save_map
 
     with new_output(out) as file:
         save_map(file, stored)
-    map_ = stored.map
-    keyframes = counted(map_.n_keyframes, "keyframe")
-    typer.echo(f"{out}: {keyframes}, {counted(map_.n_landmarks, 'landmark')}")
+    if not quiet:
+        map_ = stored.map
+        keyframes = counted(map_.n_keyframes, "keyframe")
+        typer.echo(f"{out}: {keyframes}, {counted(map_.n_landmarks, 'landmark')}")

@@ -6,6 +6,7 @@ import inspect
 import os
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
@@ -372,3 +373,20 @@ def open_given(options: SourceOptions, console: Console) -> Source:
     require_data(options)
     with console.render_bar() as on_render:
         return open_source(options, on_render)
+
+
+def require_writable(out: Path) -> None:
+    """Check that files can be written to a folder, which need not exist yet. Call this before a
+    long computation.
+
+    Raises:
+        InputError: the path is a file, or the folder is not writable.
+    """
+    try:
+        there = next(path for path in (out, *out.absolute().parents) if path.exists())
+        with TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"{out}: cannot be written ({error.strerror}); give another folder with --out."
+        ) from error

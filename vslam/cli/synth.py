@@ -164,7 +164,8 @@ def synth(
         return
     if clean:
         freed = store.clean(cache, route or None)
-        typer.echo(f"{cache}: {freed / 1e6:.0f} MB removed")
+        if not quiet:
+            typer.echo(f"{cache}: {freed / 1e6:.0f} MB removed")
         return
     if side_by_side is not None and (pairs or fisheye):
         raise InputError("--side-by-side: writes a sequence; leave out --pairs and --fisheye.")
@@ -180,6 +181,7 @@ def synth(
             raise InputError(
                 f"{form}: leave out --depth, --pairs and --verify, and one of --fisheye and --rgbd."
             )
+    ranges = _range("--lateral", lateral, -4.0, 4.0), _range("--heading", heading, 0.0, 45.0)
     variation = Variation(
         seed or town.seed, aliased or town.aliased, change or town.change, dynamic or town.moving
     )
@@ -189,7 +191,7 @@ def synth(
             from vslam.datasets.synthetic.pairs import Moves, render_pairs
 
             root = out or Path("pairs")
-            moves = Moves(_range("--lateral", lateral, -4.0), _range("--heading", heading, 0.0))
+            moves = Moves(*ranges)
             render_pairs(drive, variation, root, pairs, moves, threads=threads, on_frame=on_frame)
         elif fisheye or rgbd:
             from vslam.datasets.synthetic.fisheye import render_fisheye
@@ -217,18 +219,23 @@ def synth(
 
         frames = open_kitti(root, drive.name, max_frames=max_frames)
         calibration_file = write_side_by_side(frames, side_by_side)
-        typer.echo(
-            f"{side_by_side}: {counted(len(frames), 'frame')}, calibration in {calibration_file}"
-        )
-    typer.echo(f"{root}: " + (counted(pairs, "pair") if pairs else f"sequence {route}"))
+        if not quiet:
+            typer.echo(
+                f"{side_by_side}: {counted(len(frames), 'frame')}, calibration in "
+                f"{calibration_file}"
+            )
+    if not quiet:
+        typer.echo(f"{root}: " + (counted(pairs, "pair") if pairs else f"sequence {route}"))
 
 
-def _range(option: str, given: str, least: float) -> tuple[float, float]:
+def _range(option: str, given: str, least: float, most: float) -> tuple[float, float]:
     low, _, high = given.partition(":")
     try:
         found = float(low), float(high)
     except ValueError as error:
         raise InputError(f"{option} {given}: must be LOW:HIGH, two numbers.") from error
-    if not least <= found[0] <= found[1] <= 45.0:
-        raise InputError(f"{option} {given}: must be two ascending numbers from {least:g} to 45.")
+    if not least <= found[0] <= found[1] <= most:
+        raise InputError(
+            f"{option} {given}: must be two ascending numbers from {least:g} to {most:g}."
+        )
     return found

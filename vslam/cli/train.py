@@ -14,7 +14,17 @@ from typing import Annotated, Literal, get_args
 import typer
 
 from vslam.cli.export import app as export
-from vslam.cli.options import EXECUTION, INPUT, METHOD, OUTPUT, AllThreads, Quiet, flag, option
+from vslam.cli.options import (
+    EXECUTION,
+    INPUT,
+    METHOD,
+    OUTPUT,
+    AllThreads,
+    Quiet,
+    flag,
+    option,
+    require_writable,
+)
 from vslam.errors import InputError, counted, write_file
 
 _TRAIN_EXAMPLES = """
@@ -142,6 +152,8 @@ def train(
     from vslam.machine import available_cores
 
     until = None if max_minutes is None else time.monotonic() + 60.0 * max_minutes
+    folder = out or Path("training") / f"{network}-{preset}"
+    require_writable(folder)
     sources = [source for spec in data for source in open_source(spec)]
     if not allow_test_data:
         refuse_test_data(sources)
@@ -154,15 +166,12 @@ def train(
     if pixels is not None:
         shape = shape.for_images_of(parse_size(pixels))
     chosen = chosen.model_copy(update={"shape": shape})
-    folder = out or Path("training") / f"{network}-{preset}"
     threads = threads or available_cores()
     set_threads(threads)
     collection = load(sources, chosen.shape.input, chosen.fit, threads)
     start, chosen, report = starting_network(
         chosen, collection, weights, device, resuming=resume and (folder / CHECKPOINT).exists()
     )
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "settings.json").write_text(chosen.model_dump_json(indent=1) + "\n")
     with Console(shown=not quiet).training_bar() as on_step:
         outcome = run(
             collection, chosen, folder, device=device, threads=threads, resume=resume,
@@ -171,10 +180,10 @@ def train(
         )  # fmt: skip
     if outcome.weights.exists():
         trained, about = load_network(outcome.weights)
-        export_onnx(trained, outcome.weights.with_suffix(".onnx"), about)
         name = settings.name if settings else preset
         card = describe(trained, collection, chosen, outcome, preset=name, data=data, device=device)
         write_card({**card, **report}, outcome.weights)
+        export_onnx(trained, outcome.weights.with_suffix(".onnx"), about)
     if quiet:
         return
     if not outcome.finished:

@@ -77,10 +77,11 @@ def train(
             f"vslam vocabulary train: {error}; {unreadable} of {len(paths)} images cannot be read."
         ) from error
     write_vocabulary(trained, out)
-    typer.echo(
-        f"{out}: {trained.n_words} words from {n} descriptors of "
-        f"{counted(len(descriptors), 'image')}, k {k}, levels {levels}, seed {seed}"
-    )
+    if not quiet:
+        typer.echo(
+            f"{out}: {trained.n_words} words from {n} descriptors of "
+            f"{counted(len(descriptors), 'image')}, k {k}, levels {levels}, seed {seed}"
+        )
 
 
 @app.command(epilog="[b]Example[/b]\n  vslam vocabulary convert ORBvoc.txt orbvoc.npz")

@@ -16,6 +16,7 @@ from vslam.report.page import (
     Bullets,
     Code,
     Figure,
+    Markup,
     Page,
     Pairs,
     Part,
@@ -152,7 +153,10 @@ def show(sections: Iterable[Section], console: Console) -> None:
         text = textwrap.fill(text, console.width, subsequent_indent=indent)
         console.out(text, style=style, highlight=False)
 
-    shown = [(one.title, list(filter(_is_shown, one.parts))) for one in sections]
+    def is_printed(part: Part) -> bool:
+        return _is_shown(part) and not isinstance(part, Code | Figure | Markup)
+
+    shown = [(one.title, list(filter(is_printed, one.parts))) for one in sections]
     for k, (title, parts) in enumerate(one for one in shown if one[1]):
         if k:
             console.out()

@@ -112,7 +112,8 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
             f"--gps {path}: the fix at {time:g} s has latitude {position[0]:g} and longitude "
             f"{position[1]:g}; give degrees, from -90 to 90 and from -180 to 180."
         )
-    sigma = np.where(rows[:, 4:] > 0.0, rows[:, 4:], DEFAULT_SIGMA_M)
+    sigma = rows[:, 4:]
+    sigma = np.where((sigma > 0.0) & np.isfinite(sigma), sigma, DEFAULT_SIGMA_M)
     antenna = (0.0, 0.0, 0.0) if antenna is None else antenna
     return Fixes(rows[:, 0], rows[:, 1:4], sigma, np.array(antenna, np.float64))
 

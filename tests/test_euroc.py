@@ -221,6 +221,11 @@ def test_swapped_cameras(root):
         ("cam1/data.csv", None, "left camera alone with --sensor mono"),
         ("cam0/sensor.yaml", None, "the calibration is missing"),
         ("state_groundtruth_estimate0/data.csv", "5,1,2\n", "line 1 is not a time (ns)"),
+        (
+            "state_groundtruth_estimate0/data.csv",
+            "9223372036854775808,0,0,0,1,0,0,0\n",
+            "line 1 is not a time (ns)",
+        ),
         ("state_groundtruth_estimate0/data.csv", "", "do not increase"),
     ],
 )

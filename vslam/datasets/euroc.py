@@ -206,9 +206,9 @@ def _read_states(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
             continue
         words = line.split(",")
         try:
-            times.append(int(words[0]))
+            times.append(np.int64(words[0]))
             row = [float(word) for word in words[1:_POSE_COLUMNS]]
-        except ValueError:
+        except (ValueError, OverflowError):
             row = []
         if len(row) != _POSE_COLUMNS - 1 or not np.isfinite(row).all() or not any(row[3:]):
             raise InputError(
@@ -221,4 +221,4 @@ def _read_states(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
             f"{path}: the times of the ground truth do not increase; repair it, or remove the "
             "file to run without ground truth."
         )
-    return np.array(times, np.int64), np.array(rows)
+    return np.array(times), np.array(rows)

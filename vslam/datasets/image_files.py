@@ -104,14 +104,19 @@ def list_images(folder: Path) -> dict[str, Path]:
     The result is empty if there is no such folder.
 
     Raises:
-        InputError: a file name is not UTF-8.
+        InputError: a file name is not UTF-8, or two file names only differ in their suffixes.
     """
     if not folder.is_dir():
         return {}
-    images = [path for path in sorted(folder.iterdir()) if is_image(path)]
-    for path in images:
+    images: dict[str, Path] = {}
+    for path in filter(is_image, sorted(folder.iterdir())):
         require_utf8(path)
-    return {path.stem: path for path in images}
+        if (other := images.setdefault(path.stem, path)) is not path:
+            raise InputError(
+                f"{path}: {other.name} in this folder has the same name but for the suffix; "
+                "remove one of them."
+            )
+    return images
 
 
 def is_image(path: Path) -> bool:

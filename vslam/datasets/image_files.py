@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vslam.calibration.models import Calibration
 from vslam.camera import Camera, DepthImage, Image
 from vslam.datasets.association import Pairing
-from vslam.datasets.frames import RawSource, Size, TimedFrame, decoded
+from vslam.datasets.frames import RawSource, Size, TimedFrame, check_selection, decoded
 from vslam.errors import InputError, UnreadableImageError
 from vslam.untrusted import MOST_PIXELS, require_utf8
 
@@ -216,8 +216,7 @@ def select_frames(
     Raises:
         InputError: an option is out of range, or ``start`` is beyond the last frame.
     """
-    if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
-        raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
+    check_selection(start, every, max_frames)
     if start >= n:
         raise InputError(f"--start {start}: {source} has {n} frames; choose at most {n - 1}.")
     return np.arange(start, n, every)[:max_frames]

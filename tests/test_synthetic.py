@@ -508,6 +508,7 @@ def rounds(n, radius=32.0, laps=1.6):
     return T
 
 
+@pytest.mark.slow
 def test_an_interrupted_rendering_ends_its_threads(route, tmp_path, monkeypatch):
     closed = []
     monkeypatch.setattr(Renderer, "close", lambda renderer: closed.append(renderer))

@@ -246,6 +246,9 @@ def test_folders_of_images(folder, corridor, tmp_path):
     refused("sequence of KITTI; .* --seq", "images", tmp_path, SourceOptions(fps=10.0))
     options = SourceOptions(calib=(folder / "stereo.yaml",), right=tmp_path)
     refused("no images in this folder", "images", tmp_path / "left", options)
+    (tmp_path / "left/2.jpg").touch()
+    same = r"2.png: 2.jpg in this folder has the same name but for the suffix; remove one"
+    refused(same, "images", tmp_path, SourceOptions(calib=(folder / "stereo.yaml",)))
 
 
 def test_cameras(tmp_path, monkeypatch, side_by_side):

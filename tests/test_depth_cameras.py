@@ -403,11 +403,21 @@ def test_a_calibration_that_cannot_be_used_is_refused(recorded, monkeypatch):
     connect(monkeypatch, "oakd", recorded)
     with pytest.raises(InputError, match="the device cannot undistort"):
         open_from("oakd", "")
+    assert recorded.log[-2:] == ["stop", "close"]
     fake = realsense(recorded)
     fake.distortion = SimpleNamespace(brown_conrady="other", inverse_brown_conrady="another")
     monkeypatch.setitem(sys.modules, "pyrealsense2", fake)
     with pytest.raises(InputError, match=r"the lens model .* is not supported; .* --calib"):
         open_from("realsense", "")
+    assert recorded.log[-1] == "stop"
+
+
+def test_a_device_without_images_is_closed(recorded, monkeypatch):
+    recorded.shown = FRAMES
+    connect(monkeypatch, "oakd", recorded)
+    with pytest.raises(InputError, match="it returns no image"):
+        open_from("oakd", "")
+    assert recorded.log[-2:] == ["stop", "close"]
 
 
 @pytest.mark.parametrize("dataset", ["realsense", "oakd"])

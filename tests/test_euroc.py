@@ -202,6 +202,14 @@ def test_a_calibration_of_ones_own(root, corridor):
     refused(root, "own.yaml", "made for 640x480 pixels but the images have 480x160", calib=[path])
 
 
+def test_own_calibration_replaces_the_missing_one(root, caplog):
+    missing, own = root / "V9_01/mav0/cam0/sensor.yaml", root / "own.yaml"
+    missing.rename(own)
+    sequence = open_euroc(root, "V9_01", calib=[own, root / "V9_01/mav0/cam1/sensor.yaml"])
+    assert sequence.ground_truth is None
+    assert f"the ground truth is not used because there is no {missing}" in caplog.text
+
+
 def test_swapped_cameras(root):
     base = root / "V9_01/mav0"
     left, right = base / "cam0/sensor.yaml", base / "cam1/sensor.yaml"
@@ -221,6 +229,11 @@ def test_swapped_cameras(root):
         ("cam1/data.csv", None, "left camera alone with --sensor mono"),
         ("cam0/sensor.yaml", None, "the calibration is missing"),
         ("state_groundtruth_estimate0/data.csv", "5,1,2\n", "line 1 is not a time (ns)"),
+        (
+            "state_groundtruth_estimate0/data.csv",
+            "9223372036854775808,0,0,0,1,0,0,0\n",
+            "line 1 is not a time (ns)",
+        ),
         ("state_groundtruth_estimate0/data.csv", "", "do not increase"),
     ],
 )

@@ -50,6 +50,11 @@ def test_a_csv_file_is_read_in_the_order_of_its_times(tmp_path):
     assert len(fixes.between(1.5, 3.0)) == 1
 
 
+def test_an_infinite_sigma_counts_as_unknown(tmp_path):
+    fixes = read_fixes(csv_of(tmp_path / "fixes.csv", [1.0], np.zeros((1, 3)), sigma="inf"))
+    assert fixes.sigma.tolist() == [[DEFAULT_SIGMA_M] * 3]
+
+
 def oxts(folder, times=3, packets=3):
     (folder / "data").mkdir(parents=True)
     stamps = [f"2011-09-26 13:02:25.9{k}4389445" for k in range(times)]
@@ -166,6 +171,7 @@ BAD = {
     "no fix": (lambda folder: bag_of(folder / "a.bag", [(1, -1, 48.0, 0)]), "/gps/fix is a fix"),
     "no stamp": (lambda folder: bag_of(folder / "a.bag", [(0, 0, 48.0, 0)]), "no time stamps"),
     "no bag": (refused("no", "a.bag"), "cannot be read as a bag"),
+    "no bag in capitals": (refused("no", "a.BAG"), "cannot be read as a bag"),
 }  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import json
 import re
 import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 from vslam.cli.main import app
 from vslam.config import Config
 from vslam.errors import InputError, ResultsError
+from vslam.evaluation.map_alignment import name_of_world
 from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.geometry import inverse
 from vslam.loopclosure.registry import create_detector
@@ -279,6 +281,20 @@ def mapped(kitti_tree, tmp_path_factory) -> Path:
     assert result.exit_code == 0, result.output
     assert (out / "kept.npz").read_bytes() == (out / "latest" / "map.npz").read_bytes()
     return out / "latest"
+
+
+@pytest.mark.parametrize(("dataset", "one", "other", "same"), [
+    ("synthetic", "lane", "lane+change:1+seed:1", True),
+    ("synthetic", "lane", "night", True),
+    ("synthetic", "lane", "block", False),
+    ("images", "yard+1", "yard+2", False),
+])  # fmt: skip
+def test_only_rendered_drives_along_one_route_share_a_world(dataset, one, other, same):
+    worlds = {
+        name_of_world(SimpleNamespace(sequence=SimpleNamespace(dataset=dataset, name=name)))
+        for name in (one, other)
+    }
+    assert (len(worlds) == 1) == same
 
 
 @pytest.mark.slow

@@ -276,3 +276,15 @@ def test_contact_sheet():
     plain = contact_sheet(source, parse_perturbation("none", 0), [0])
     change = plain[22 : 22 + 120, 3 * 488 : 3 * 488 + 480]
     assert (change == 128).all()
+
+
+def test_contact_sheet_of_depth_images_with_a_dropped_frame():
+    height, width = TEXTURE.shape
+    camera = Camera(100.0, 100.0, width / 2, height / 2, 0.1, width, height, depth=True)
+    depth = np.ones(TEXTURE.shape, np.float32)
+    stored = stored_frames(TIMES[:2], lambda k, image_map: (TEXTURE, depth))
+    source = Source(dataset="drawn", name="drawn", camera=camera, stored=stored)
+    sheet = contact_sheet(source, parse_perturbation("drop:99", 0), [0, 1])
+    assert sheet.shape == (2 * (120 + 30), 3 * (480 + 8))
+    dropped = sheet[150 + 22 : 150 + 22 + 120, 488 : 488 + 480]
+    assert (dropped == 0).all()

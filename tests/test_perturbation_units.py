@@ -99,6 +99,14 @@ def test_depth_of_stereo_is_that_of_both_sides():
         assert depth.shape == images[0].shape
 
 
+@pytest.mark.parametrize("width", [8, 33, 34, 63])
+def test_a_narrow_image_has_depth(width):
+    left, right = (np.ascontiguousarray(image[:, :width]) for image in wall(20.0))
+    for depth in dense_depths(CAMERA, left, right):
+        assert depth.shape == left.shape
+        assert (depth > 0).all()
+
+
 def test_night_takes_stops_and_counts_electrons():
     grey = np.full((400, 600), 200, np.uint8)
     drive = drive_of(Camera(400.0, 400.0, 300.0, 200.0, 0.5, 600, 400))

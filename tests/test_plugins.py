@@ -410,6 +410,10 @@ def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
         (("camera=inner.camera", "camera=3"), "camera is int, not vslam.camera.Camera"),
         (("live=LIVE", "n_expected=-1"), "n_expected is -1, neither None nor a number"),
         (
+            ("play=play", "stored=(__import__('types').SimpleNamespace(timestamp=0.0),)"),
+            "stored has a SimpleNamespace, not vslam.datasets.frames.TimedFrame",
+        ),
+        (
             ("play=play", "stored=(*inner.stored, inner.stored[0])"),
             "x: the times of the frames do not increase",
         ),

@@ -310,6 +310,16 @@ class FakeCamera:
         pass
 
 
+def test_colours_of_a_live_camera(corridor, tmp_path, monkeypatch):
+    image = corridor.left[0]
+    tinted = np.dstack([image, image // 2, 255 - image])
+    FakeCamera.images = [tinted]
+    monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)
+    calib = write_calibration(tmp_path / "left.yaml", corridor.camera, mono=True)
+    source = open_from("camera", "0", SourceOptions(calib=(calib,), sensor="mono"))
+    assert np.array_equal(next(source.frames()).colour(), tinted[..., ::-1])
+
+
 def test_ctrl_c_is_the_regular_end_of_a_camera(folder, corridor, monkeypatch):
     FakeCamera.images = [np.hstack(p) for p in zip(corridor.left, corridor.right, strict=True)]
     monkeypatch.setattr(cv2, "VideoCapture", FakeCamera)

@@ -509,6 +509,22 @@ def rounds(n, radius=32.0, laps=1.6):
 
 
 @pytest.mark.slow
+def test_an_interrupted_rendering_ends_its_threads(route, tmp_path, monkeypatch):
+    closed = []
+    monkeypatch.setattr(Renderer, "close", lambda renderer: closed.append(renderer))
+    small = replace(route, camera=Camera(45.0, 45.0, 39.0, 12.0, 0.54, 78, 24))
+
+    def interrupted(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        store.render_sequence(small, Variation(), tmp_path, until=2, on_frame=interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        render_pairs(small, Variation(), tmp_path, 1, kinds=("shift",), on_frame=interrupted)
+    assert len(closed) == 2
+
+
+@pytest.mark.slow
 def test_pairs_are_labelled(tmp_path):
     route = route_of_poses(rounds(160), "round")
     cheap = replace(route, camera=Camera(180.0, 180.0, 155.0, 47.0, 0.54, 310, 94))

@@ -13,6 +13,9 @@ from vslam.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
 
+DEPTH_NEAR_S = 0.02
+"""Upper limit of the seconds between an image and its depth, as in TUM's associate.py."""
+
 # Longest gap in the ground truth across which poses are interpolated. Ground truth comes at 100 Hz
 # (TUM), 200 Hz (EuRoC) or 10 Hz (vehicles). At an acceleration of 2 m/s^2, linear interpolation is
 # off by 6 mm in the middle of this gap.

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from vslam.calibration.formats import read_ros
 from vslam.calibration.models import Calibration
 from vslam.camera import DepthImage, Image, ImageMap
-from vslam.datasets.association import Pairing
+from vslam.datasets.association import DEPTH_NEAR_S, Pairing
 from vslam.datasets.bag_messages import (
     CAMERA_INFO_TYPE,
     IMAGE_TYPES,
@@ -48,8 +48,8 @@ Bag = Any  # rosbags.highlevel.AnyReader
 _FIX_TYPE = "sensor_msgs/msg/NavSatFix"
 _MOST_METADATA = 1_000_000  # bytes; a hundred topics need 100,000
 _TOLERANCE_NS = 5_000_000
-# As in TUM's associate.py. A Kinect takes images and depth alternately.
-_DEPTH_TOLERANCE_NS = 20_000_000
+# A Kinect takes images and depth alternately.
+_DEPTH_TOLERANCE_NS = round(1e9 * DEPTH_NEAR_S)
 _NEEDED = {
     "mono": "an image topic",
     "stereo": "two image topics",

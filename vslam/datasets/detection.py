@@ -23,6 +23,11 @@ def _with_subfolders(folder: Path) -> tuple[Path, ...]:
     return (folder, *(path for path in folder.glob("*") if path.is_dir()))
 
 
+def is_bag(path: Path) -> bool:
+    """Return whether a path is a bag of ROS, which may be a file or a folder."""
+    return path.suffix.lower() in _BAG_SUFFIXES or (path / "metadata.yaml").is_file()
+
+
 # The first kind whose test succeeds is chosen. The order matters: the folders of data sets also
 # contain images, so that folders of images must come last.
 _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
@@ -44,7 +49,7 @@ _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
     (
         "bag",
         f"a file {', '.join(sorted(_BAG_SUFFIXES))} or metadata.yaml",
-        lambda path: path.suffix.lower() in _BAG_SUFFIXES or (path / "metadata.yaml").is_file(),
+        is_bag,
     ),
     ("images", "images (png, jpg, ...) in the folder or in left/ and right/", has_images),
     ("video", "any other file, as a video", Path.is_file),

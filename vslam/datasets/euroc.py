@@ -9,6 +9,7 @@ FOLDER/mav0/state_groundtruth_estimate0/   optional: ground truth of the body
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence as Several
 from pathlib import Path
 
@@ -28,6 +29,8 @@ from vslam.datasets.image_files import (
 from vslam.datasets.rectified import rectified
 from vslam.errors import InputError
 from vslam.trajectory import Trajectory
+
+_log = logging.getLogger(__name__)
 
 _HOME = "https://projects.asl.ethz.ch/datasets/euroc-mav/"
 _MOST_APART_NS = 5_000_000  # between the images of a pair, which are triggered together
@@ -191,7 +194,15 @@ def _read_ground_truth(base: Path, stamps: NDArray[np.int64]) -> NDArray[np.floa
     T_w_sensor = poses_at(path, measured, (stamps - times[0]) * 1e-9)
     if T_w_sensor is None:
         return None
-    T_body_camera = read_document(base / "cam0" / "sensor.yaml").matrix("T_BS", 4, 4)
+    sensor = base / "cam0" / "sensor.yaml"
+    if not sensor.is_file():
+        _log.warning(
+            "%s: the ground truth is not used because there is no %s with the pose of the camera.",
+            path,
+            sensor,
+        )
+        return None
+    T_body_camera = read_document(sensor).matrix("T_BS", 4, 4)
     T_body_sensor = np.eye(4)
     if (folder / "sensor.yaml").is_file():
         T_body_sensor = read_document(folder / "sensor.yaml").matrix("T_BS", 4, 4)
@@ -206,9 +217,9 @@ def _read_states(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
             continue
         words = line.split(",")
         try:
-            times.append(int(words[0]))
+            times.append(np.int64(words[0]))
             row = [float(word) for word in words[1:_POSE_COLUMNS]]
-        except ValueError:
+        except (ValueError, OverflowError):
             row = []
         if len(row) != _POSE_COLUMNS - 1 or not np.isfinite(row).all() or not any(row[3:]):
             raise InputError(
@@ -221,4 +232,4 @@ def _read_states(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
             f"{path}: the times of the ground truth do not increase; repair it, or remove the "
             "file to run without ground truth."
         )
-    return np.array(times, np.int64), np.array(rows)
+    return np.array(times), np.array(rows)

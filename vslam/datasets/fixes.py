@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.bag import read_fixes_of_bag
+from vslam.datasets.detection import is_bag
 from vslam.datasets.frames import Source
 from vslam.errors import InputError
 from vslam.trajectory import read_table
@@ -32,7 +33,6 @@ _NAMES = {
     "sigma": ("sigma",),
 }
 _OXTS_COLUMNS, _POS_ACCURACY = 30, 23  # numbers in an OXTS packet, and the index of pos_accuracy
-_BAGS = (".bag", ".mcap", ".db3")
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
         ) from error
     if not path.exists():
         raise InputError(f"--gps {path}: no such file or folder; give a CSV file, a bag or oxts.")
-    if path.suffix in _BAGS or (path / "metadata.yaml").is_file():
+    if is_bag(path):
         rows = read_fixes_of_bag(path)
     elif path.is_dir():
         folder = path / "oxts" if (path / "oxts").is_dir() else path
@@ -112,7 +112,8 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
             f"--gps {path}: the fix at {time:g} s has latitude {position[0]:g} and longitude "
             f"{position[1]:g}; give degrees, from -90 to 90 and from -180 to 180."
         )
-    sigma = np.where(rows[:, 4:] > 0.0, rows[:, 4:], DEFAULT_SIGMA_M)
+    sigma = rows[:, 4:]
+    sigma = np.where((sigma > 0.0) & np.isfinite(sigma), sigma, DEFAULT_SIGMA_M)
     antenna = (0.0, 0.0, 0.0) if antenna is None else antenna
     return Fixes(rows[:, 0], rows[:, 1:4], sigma, np.array(antenna, np.float64))
 

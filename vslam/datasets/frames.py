@@ -220,8 +220,7 @@ def selected(
     Raises:
         InputError: an option is out of range, or ``start`` is beyond the last frame.
     """
-    if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
-        raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
+    check_selection(start, every, max_frames)
     whole = source.n_expected
     if whole is not None and start >= whole:
         about = "" if source.seekable else "about "
@@ -235,6 +234,16 @@ def selected(
         return replace(source, stored=source.stored[chosen], ground_truth=truth)
     n = max_frames if whole is None else len(range(*chosen.indices(whole)))
     return replace(source, n_expected=n, play=partial(_play_selected, source, chosen))
+
+
+def check_selection(start: int, every: int, max_frames: int | None) -> None:
+    """Check that the options that select frames are in their ranges.
+
+    Raises:
+        InputError: an option is out of range.
+    """
+    if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
+        raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
 
 
 def _play_selected(source: Source | RawSource, chosen: slice) -> Iterator[TimedFrame]:

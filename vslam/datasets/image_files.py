@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vslam.calibration.models import Calibration
 from vslam.camera import Camera, DepthImage, Image
 from vslam.datasets.association import Pairing
-from vslam.datasets.frames import RawSource, Size, TimedFrame, decoded
+from vslam.datasets.frames import RawSource, Size, TimedFrame, check_selection, decoded
 from vslam.errors import InputError, UnreadableImageError
 from vslam.untrusted import MOST_PIXELS, require_utf8
 
@@ -104,14 +104,19 @@ def list_images(folder: Path) -> dict[str, Path]:
     The result is empty if there is no such folder.
 
     Raises:
-        InputError: a file name is not UTF-8.
+        InputError: a file name is not UTF-8, or two file names only differ in their suffixes.
     """
     if not folder.is_dir():
         return {}
-    images = [path for path in sorted(folder.iterdir()) if is_image(path)]
-    for path in images:
+    images: dict[str, Path] = {}
+    for path in filter(is_image, sorted(folder.iterdir())):
         require_utf8(path)
-    return {path.stem: path for path in images}
+        if (other := images.setdefault(path.stem, path)) is not path:
+            raise InputError(
+                f"{path}: {other.name} in this folder has the same name but for the suffix; "
+                "remove one of them."
+            )
+    return images
 
 
 def is_image(path: Path) -> bool:
@@ -211,8 +216,7 @@ def select_frames(
     Raises:
         InputError: an option is out of range, or ``start`` is beyond the last frame.
     """
-    if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
-        raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
+    check_selection(start, every, max_frames)
     if start >= n:
         raise InputError(f"--start {start}: {source} has {n} frames; choose at most {n - 1}.")
     return np.arange(start, n, every)[:max_frames]

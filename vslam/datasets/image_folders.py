@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.datasets.association import Pairing, associate
+from vslam.datasets.association import DEPTH_NEAR_S, Pairing, associate
 from vslam.datasets.frames import RawSource
 from vslam.datasets.image_files import (
     checked_files,
@@ -50,7 +50,6 @@ PAIRS = (
 DEPTH_PAIRS = (("rgb", "depth"), ("color", "depth"), ("colour", "depth"), ("image", "depth"))
 # Longest median interval between images. A longer one suggests that the times are not in seconds.
 _LONGEST_INTERVAL_S = 10.0
-_NEAR_S = 0.02  # as in TUM's associate.py
 _TIME_FILES = ("times.txt", "timestamps.txt")
 _EXIF = 0x8769  # tags of EXIF 2.32
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL = 0x9003, 0x9291
@@ -244,14 +243,14 @@ def _paired_by_time(
     if any(time is None for side in times for time in side):
         return None
     colour, depth = (np.array(side, np.float64) for side in times)
-    pairs = associate(colour, depth, _NEAR_S)
+    pairs = associate(colour, depth, DEPTH_NEAR_S)
     if not len(pairs[0]):
         raise InputError(
             f"{files[1][0].parent}: by the times in their names, no depth image is within 20 ms of "
             "an image; name folders of one recording."
         )
     fix = "correct the names if the times of one folder are late, or run with --sensor mono"
-    pairing = Pairing(files[0][0].parent, "depth image", _NEAR_S, fix)
+    pairing = Pairing(files[0][0].parent, "depth image", DEPTH_NEAR_S, fix)
     pairing.count(colour, pairs[0], depth)
     return [[side[k] for k in chosen] for side, chosen in zip(files, pairs, strict=True)], pairing
 

@@ -9,6 +9,7 @@ matching, and registers it to the colour image.
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from datetime import timedelta
 from typing import Any
 
@@ -38,16 +39,20 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
     dai = maker_package("depthai", "oakd")
     name = f"oakd {serial}".rstrip()
     try:
-        device = dai.Device(serial) if serial else dai.Device()
-        serial = device.getDeviceId()
-        name = f"oakd {serial}"
-        pipeline = dai.Pipeline(device)
-        queue = _queue(dai, pipeline, sensor)
-        pipeline.start()
-        first = queue.get(timedelta(seconds=TIMEOUT_S))
-        if first is None:
-            raise RuntimeError("it returns no image")
-        calibration = _calibration(dai, device, first, sensor)
+        with ExitStack() as opened:
+            device = dai.Device(serial) if serial else dai.Device()
+            opened.callback(device.close)
+            serial = device.getDeviceId()
+            name = f"oakd {serial}"
+            pipeline = dai.Pipeline(device)
+            queue = _queue(dai, pipeline, sensor)
+            pipeline.start()
+            opened.callback(pipeline.stop)
+            first = queue.get(timedelta(seconds=TIMEOUT_S))
+            if first is None:
+                raise RuntimeError("it returns no image")
+            calibration = _calibration(dai, device, first, sensor)
+            stop = opened.pop_all().close  # from here on, DepthCamera stops the device
     except RuntimeError as error:
         raise InputError(
             f"{name}: {error}; connect an OAK camera, and close other programs that use it."
@@ -63,10 +68,6 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
         left = images["left"]
         second = None if sensor == "mono" else images["second"].getFrame()
         return Grabbed(left.getTimestamp().total_seconds(), left.getFrame(), second)
-
-    def stop() -> None:
-        pipeline.stop()
-        device.close()
 
     return DepthCamera("oakd", serial, calibration, grab, stop)
 

@@ -63,6 +63,8 @@ def _wrong_source(raw: object) -> str:
         return f"returned {type(raw).__name__}, not vslam.datasets.frames.Source"
     if not isinstance(raw.camera, Camera):
         return f"camera is {type(raw.camera).__name__}, not vslam.camera.Camera"
+    if wrong := [frame for frame in raw.stored if not isinstance(frame, TimedFrame)]:
+        return f"stored has a {type(wrong[0]).__name__}, not vslam.datasets.frames.TimedFrame"
     n = raw.n_expected
     if n is None or (isinstance(n, int) and n > 0):
         return ""

@@ -9,6 +9,7 @@ switched off for stereo, because its dots would move with the camera.
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,10 @@ def open_realsense(serial: str, sensor: str | None) -> DepthCamera:
         if depth_sensor.supports(rs.option.emitter_enabled):
             depth_sensor.set_option(rs.option.emitter_enabled, float(sensor == "rgbd"))
         profile = pipeline.start(config)
-        calibration = _calibration(rs, profile, depth_sensor, sensor, serial)
+        with ExitStack() as failed:
+            failed.callback(pipeline.stop)
+            calibration = _calibration(rs, profile, depth_sensor, sensor, serial)
+            failed.pop_all()  # the pipeline is only stopped if the calibration fails
     except RuntimeError as error:
         raise InputError(
             f"realsense {serial}: {error}; connect it to a USB 3 port, and close other programs "

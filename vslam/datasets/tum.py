@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.datasets.association import Pairing, associate, poses_at
+from vslam.datasets.association import DEPTH_NEAR_S, Pairing, associate, poses_at
 from vslam.datasets.frames import Source
 from vslam.datasets.image_files import (
     checked_files,
@@ -34,7 +34,6 @@ from vslam.trajectory import read_trajectory
 
 _HOME = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset"
 CALIBRATION = "calibration.yaml"
-_NEAR_S = 0.02  # as in TUM's associate.py
 _DEPTH_SCALE = 5000.0  # from TUM's page "File Formats"
 # From TUM's page "Intrinsic Camera Calibration"; the images of freiburg3 are already undistorted.
 _CAMERAS = {
@@ -95,7 +94,7 @@ def open_tum(
     pairing = None
     if not monocular:
         depth_times, depth_files = _read_list(folder / "depth.txt")
-        frames, partners = associate(times, depth_times, _NEAR_S)
+        frames, partners = associate(times, depth_times, DEPTH_NEAR_S)
         if not len(frames):
             raise InputError(
                 f"{folder}: no colour image has a depth image within 20 ms; take rgb.txt and "
@@ -105,7 +104,7 @@ def open_tum(
             "correct the times in rgb.txt or depth.txt if those of one list are late, or run on "
             "the colour images with --sensor mono"
         )
-        pairing = Pairing(folder, "depth image", _NEAR_S, fix)
+        pairing = Pairing(folder, "depth image", DEPTH_NEAR_S, fix)
         pairing.count(times, frames, depth_times)
     chosen = select_frames(folder, len(frames), start, every, max_frames)
     times = times[frames[chosen]]

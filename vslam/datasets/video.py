@@ -260,8 +260,11 @@ def _play_live(
             decoded, image = capture.read()
             if not decoded:
                 break
-            sides = partial(read_sides, image, side_by_side, monocular)
-            yield TimedFrame(time.monotonic(), sides)
+            yield TimedFrame(
+                time.monotonic(),
+                partial(read_sides, image, side_by_side, monocular),
+                colour=partial(left_in_colour, image, side_by_side),
+            )
             n += 1
     finally:
         capture.release()

@@ -69,11 +69,11 @@ def how_to_swap(dataset: str, options: RunOptions) -> str:
     if dataset == "images" and options.right is not None:
         return f"swap them: --data {options.right} --right {options.data}"
     if dataset == "images":
-        return "swap the folders of --data and --right"
+        return "swap the folders of the left and the right images"
     if dataset == "bag" and options.topics:
         return f"swap them: --topics {','.join(reversed(options.topics.split(',')))}"
     if dataset == "bag":
-        return "swap the two topics of --topics"
+        return "give both topics with --topics, that of the left images first"
     if dataset == "video":
         return "swap the halves of the images: the left camera's half must be on the left"
     folders = {"kitti": "image_0 and image_1", "euroc": "cam0 and cam1"}

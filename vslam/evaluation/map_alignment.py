@@ -18,10 +18,16 @@ from vslam.run.outcome import RunOutcome
 def name_of_world(outcome: RunOutcome) -> str:
     """Return the name of the world frame of a run's ground truth.
 
-    What follows a ``+`` in the name of the sequence is left out, because rendered drives along one
-    route have the same world frame, even if the light or the traffic differs.
+    It contains the name of the sequence. For rendered drives, it contains the route instead,
+    because all drives along one route have the same world frame, even if the light or the traffic
+    differs.
     """
-    return f"{outcome.sequence.dataset} {outcome.sequence.name.partition('+')[0]}"
+    dataset, name = outcome.sequence.dataset, outcome.sequence.name
+    if dataset == "synthetic":
+        from vslam.datasets.synthetic import parse_drive  # imports the renderer
+
+        name, _ = parse_drive(name)
+    return f"{dataset} {name}"
 
 
 def truth_alignment_of(outcome: RunOutcome, evaluation: Evaluation) -> TruthAlignment:

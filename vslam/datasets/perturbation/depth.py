@@ -60,7 +60,9 @@ def disparity(
     if mirrored:
         pair = [np.ascontiguousarray(i[:, ::-1]) for i in pair]
     most = camera.bf / _NEAREST_M / _SHRINK
-    levels = int(np.clip(16 * np.ceil(most / 16.0), 16, 16 * (size[0] // 32)))
+    levels = int(np.clip(16 * np.ceil(most / 16.0), 16, max(16, 16 * (size[0] // 32))))
+    if size[0] <= levels:  # OpenCV fails, because no pixel has the whole search range
+        return np.zeros(image.shape, np.float32)
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=levels,

@@ -222,8 +222,10 @@ def _row(sequence: Source, perturbation: Perturbation, index: int, label: str) -
     try:
         new_left, new_second = perturbation.apply(index, t, left, second)
     except DroppedFrameError:
-        black = np.zeros_like(left)
-        new_left, new_second = black, None if second is None else black
+        new_left, new_second = (
+            np.zeros_like(left),
+            None if second is None else np.zeros_like(second),
+        )
     pairs = {"left": (left, new_left)}
     if new_second is not None and new_second.dtype == np.uint8:
         pairs["right"] = np.asarray(second, np.uint8), np.asarray(new_second, np.uint8)

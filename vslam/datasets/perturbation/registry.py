@@ -14,15 +14,14 @@ import numpy as np
 
 from vslam.camera import Image
 from vslam.datasets.perturbation import glass, light, motion, sensor, stereo, weather
-from vslam.datasets.perturbation.kinds import LawKind
+from vslam.datasets.perturbation.kinds import Law, LawKind
 from vslam.errors import InputError, UnreadableImageError
 from vslam.plugins import PERTURBATIONS, PlugIn, find_plugins
 
-PlugInLaw = Callable[[int, float, int, Image], Image]
 _PROBE = (48, 64)  # rows and columns of the image on which a new law is tried
 
 
-def plugin_laws() -> dict[str, Callable[[float, tuple[int, int]], PlugInLaw]]:
+def plugin_laws() -> dict[str, Callable[[float, tuple[int, int]], Law]]:
     """Return the laws (kinds of perturbation) of plug-ins in other Python packages, by name.
 
     Each law is a function that takes a strength, and a tuple of the user's seed and a number for
@@ -31,7 +30,7 @@ def plugin_laws() -> dict[str, Callable[[float, tuple[int, int]], PlugInLaw]]:
     return {name: partial(_make, plugin) for name, plugin in find_plugins(PERTURBATIONS).items()}
 
 
-def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> PlugInLaw:
+def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> Law:
     """Make a perturbation of a plug-in, and try it on a grey image."""
     law = plugin.call(strength, stream)
     if not callable(law):
@@ -44,7 +43,7 @@ def _make(plugin: PlugIn, strength: float, stream: tuple[int, int]) -> PlugInLaw
     return checked
 
 
-def _apply(plugin: PlugIn, law: PlugInLaw, frame: int, t: float, side: int, image: Image) -> Image:
+def _apply(plugin: PlugIn, law: Law, frame: int, t: float, side: int, image: Image) -> Image:
     """Apply a perturbation of a plug-in to an image. If it fails, the run skips the frame."""
     view = image.view()
     view.flags.writeable = False

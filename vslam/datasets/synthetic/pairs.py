@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -116,7 +117,7 @@ def render_pairs(
     table = io.StringIO()
     rows = csv.writer(table)
     rows.writerow(_COLUMNS)
-    with writing(folder):
+    with closing(renderer), writing(folder):
         (folder / "images").mkdir(parents=True, exist_ok=True)
         for k in range(count):
             kind = kinds[k % len(kinds)]
@@ -153,7 +154,6 @@ def render_pairs(
             if on_frame:
                 on_frame(k + 1, count)
         (folder / "pairs.csv").write_text(table.getvalue())
-    renderer.close()
 
 
 def _view(
@@ -204,11 +204,11 @@ def _look_alikes(route: Route, town: Town, passes: Passes, threads: int) -> NDAr
     renderer = Renderer(small, town.atlas, town.sky, threads)
     moment = passes.at(0)
     seen = []
-    for k in chosen:
-        (view,) = renderer.views(moment, route.T_wc[k])
-        blurred = cv2.GaussianBlur(np.minimum(view.image, 255.0), (0, 0), 1.5).ravel()
-        seen.append((blurred - blurred.mean()) / (blurred.std() + 1e-6))
-    renderer.close()
+    with closing(renderer):
+        for k in chosen:
+            (view,) = renderer.views(moment, route.T_wc[k])
+            blurred = cv2.GaussianBlur(np.minimum(view.image, 255.0), (0, 0), 1.5).ravel()
+            seen.append((blurred - blurred.mean()) / (blurred.std() + 1e-6))
     score = np.array(seen) @ np.array(seen).T / seen[0].size
     for k, T in enumerate(route.T_wc[chosen]):
         score[k, ~_different(T, route.T_wc[chosen])] = -np.inf

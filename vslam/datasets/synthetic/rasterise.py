@@ -15,10 +15,10 @@ FAR = 400.0  # m
 LAYER_STEP = 1e-3  # relative depth by which a layer is drawn in front of the next lower one
 _SEAM = 1e-6  # overlap of adjacent surfaces as a fraction of an edge, so that there are no gaps
 
-# Columns of the result of ``find_visible``. PLANE has 3 x 3 coefficients of s/z, t/z and 1/z, which
-# are affine functions of the pixel (u, v). TEXTURE has 2 x 3 coefficients of the two texture
-# coordinates divided by z. Each of the other columns is a single number.
-PLANE, TEXTURE, FIRST_ROW, LAST_ROW, TRIANGLE, LAYER = 0, 9, 15, 16, 17, 18
+# Columns of the result of ``find_visible``. Columns 0 to 8 have 3 x 3 coefficients of s/z, t/z and
+# 1/z, which are affine functions of the pixel (u, v). TEXTURE has 2 x 3 coefficients of the two
+# texture coordinates divided by z. Each of the other columns is a single number.
+TEXTURE, FIRST_ROW, LAST_ROW, TRIANGLE, LAYER = 9, 15, 16, 17, 18
 NUMBER, DETAIL_U, DETAIL_V, DETAIL, AMBIENT, SUN, GLOW, KEY, COLUMNS = range(19, 28)
 
 

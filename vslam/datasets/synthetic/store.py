@@ -12,6 +12,7 @@ import os
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -244,14 +245,13 @@ def render_frames(
             centimetres = np.clip(np.rint(views[0].depth * DEPTH_SCALE), 0, 65535)
             write_png(paths[2], centimetres.astype(np.uint16), 1)
 
-    with ThreadPoolExecutor(threads) as pool:
+    with closing(renderer), ThreadPoolExecutor(threads) as pool:
         try:
             for done, _ in enumerate(pool.map(render, frames), total - len(frames) + 1):
                 if on_frame:
                     on_frame(done, total)
         finally:
             pool.shutdown(cancel_futures=True)
-    renderer.close()
 
 
 def _record_of(route: Route, variation: Variation, depth: bool) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import cv2
 import numpy as np
 import torch
@@ -47,3 +49,13 @@ def views(places: int, seed: int = 0) -> Collection:
     relation = np.where(place[:, None] == place[None], 1, -1).astype(np.int8)
     names = tuple(f"blobs/all/{k}" for k in range(2 * places))
     return Collection(names, np.stack(images), relation, place, (("blobs", 2 * places),))
+
+
+def masked(network: SiameseNetwork, drop: torch.Tensor) -> SiameseNetwork:
+    """Copy a network and mask the primary capsules ``drop``, ``(T, K)`` bool, in the copy. Masked
+    capsules are ignored, but still computed."""
+    copied = copy.deepcopy(network)
+    layer = copied.branch.capsules
+    layer.alive.copy_(~drop.flatten())
+    layer.masked = True
+    return copied

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import pytest
 import reference_routing
 import torch
-from siamese_worlds import SMALL, small_network
+from siamese_worlds import SMALL, masked, small_network
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.images import to_size
@@ -22,7 +20,6 @@ from vslam.loopclosure.training.extractors import LIGHT_BLOCKS, grid_side
 from vslam.loopclosure.training.preprocessing import to_tensor
 from vslam.loopclosure.training.pruning import lowest, mean_couplings, pruned
 from vslam.loopclosure.training.siamese import (
-    SiameseNetwork,
     build_network,
     for_inference,
     load_network,
@@ -199,16 +196,6 @@ def test_texture_is_more_than_a_grey_level():
     x[..., 1, 2] = 3.0 / 255
     at = textured(x)[0, 0].nonzero().tolist()
     assert at == [[0, 2], [1, 1], [1, 2]]  # pixels that differ from the one on the right or below
-
-
-def masked(network: SiameseNetwork, drop: torch.Tensor) -> SiameseNetwork:
-    """Copy a network and mask the primary capsules ``drop``, ``(T, K)`` bool, in the copy. Masked
-    capsules are ignored, but still computed."""
-    copied = copy.deepcopy(network)
-    layer = copied.branch.capsules
-    layer.alive.copy_(~drop.flatten())
-    layer.masked = True
-    return copied
 
 
 @pytest.mark.slow

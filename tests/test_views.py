@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
-from siamese_worlds import SMALL, small_network, small_settings, views
+from siamese_worlds import SMALL, masked, small_network, small_settings, views
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.images import parse_size, to_size
@@ -19,7 +19,7 @@ from vslam.loopclosure.training.export import export_onnx
 from vslam.loopclosure.training.initial_network import resized, starting_network
 from vslam.loopclosure.training.lite import LiteExtractor
 from vslam.loopclosure.training.preprocessing import Unrolling
-from vslam.loopclosure.training.pruning import lowest, masked, mean_couplings, pruned
+from vslam.loopclosure.training.pruning import lowest, mean_couplings, pruned
 from vslam.loopclosure.training.siamese import (
     SiameseNetwork,
     aligned,

@@ -525,6 +525,13 @@ def test_versions_of_the_method_are_different_systems(run_folder: Path, tmp_path
     assert summarize(collect([tmp_path], [])).systems == ["bow (method=1)", "bow (method=2)"]
 
 
+def test_runs_of_other_systems_do_not_change_names(run_folder: Path, tmp_path: Path):
+    copy_run(run_folder, tmp_path / "ours", detector="bow", mask="hood.png")
+    other = copy_run(run_folder, tmp_path / "other", detector="orbslam3")
+    (other / "run.json").unlink()
+    assert summarize(collect([tmp_path], [])).systems == ["bow", "orbslam3"]
+
+
 def test_options_that_change_results_make_systems_too(run_folder: Path, tmp_path: Path):
     for name, options in (("a", {}), ("b", {"weights": "mine.onnx"}), ("c", {"realtime": True})):
         copy_run(run_folder, tmp_path / name, detector="capsule", sensor="mono", **options)

@@ -223,12 +223,13 @@ def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
 
 
 def _name_by_settings(found: Found) -> None:
-    """Append the settings to the names of the systems, except settings that all runs share."""
-    first = found.runs[0].settings
+    """Append the settings to the names of the systems, except settings that all runs share. Runs of
+    other SLAM systems have no settings, and do not count here."""
+    settings = [run.settings for run in found.runs if run.settings] or [{}]
     shared = {
         name: value
-        for name, value in first.items()
-        if all(run.settings.get(name) == value for run in found.runs)
+        for name, value in settings[0].items()
+        if all(one.get(name) == value for one in settings)
     }
     if told := [f"{name}={value}" for name, value in shared.items() if name != "method"]:
         found.notes.append(f"all runs have {', '.join(told)}")

@@ -320,7 +320,8 @@ def test_failing_disk_neither_ends_nor_hangs_the_run(tmp_path: Path) -> None:
         print("finished")
     """
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script), str(tmp_path / "recording.rrd")],
+        # -B: Python would write half a bytecode file, and read it later.
+        [sys.executable, "-B", "-c", textwrap.dedent(script), str(tmp_path / "recording.rrd")],
         cwd=Path(__file__).parent,
         capture_output=True,
         text=True,

@@ -15,13 +15,12 @@ from vslam.camera import Image
 from vslam.features import Features, TrackingState
 from vslam.frontend.frame import Frame
 from vslam.frontend.matching import count_elsewhere
-from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.tracker import Found, judge
 from vslam.frontend.tracking import (
     TrackingContext,
     match_descriptors,
-    observations,
     refine,
+    sampled_pose,
     track_local_map,
 )
 from vslam.loops import Localisation, LoopCandidate
@@ -152,14 +151,8 @@ def _locate(
     feature, landmark = match_descriptors(frame, place, config.match_distance, config.match_ratio)
     if len(feature) < config.min_matches:
         return 0
-    T_camera_w, inlier = ransac_pose(
-        place.xyz[landmark],
-        *observations(frame, feature, context),
-        context.camera.intrinsics,
-        np.uint64(seed),
-        config.min_consensus,
-        config.max_draws,
-        config.confidence,
+    T_camera_w, inlier = sampled_pose(
+        frame, feature, place.xyz[landmark], context, min_inliers=config.min_consensus, seed=seed
     )
     if np.count_nonzero(inlier) < config.min_consensus:
         return 0

@@ -128,7 +128,7 @@ def track_sudden_motion(
     Returns:
         Number of matches, and number of inliers of the pose optimisation.
     """
-    config, sampling = context.config.tracking, context.config.relocalization
+    config = context.config.tracking
     least = config.min_inliers_motion
     matches = _match_previous(
         frame, previous, T_cw, context, config.sudden_window, config.match_ratio
@@ -136,20 +136,48 @@ def track_sudden_motion(
     if matches < least:
         return matches, 0
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
-    T_camera_w, inlier = ransac_pose(
-        frame.xyz[matched],
-        *observations(frame, matched, context),
-        context.camera.intrinsics,
-        np.uint64(frame.index),
-        least,
-        sampling.max_draws,
-        sampling.confidence,
+    T_camera_w, inlier = sampled_pose(
+        frame, matched, frame.xyz[matched], context, min_inliers=least, seed=frame.index
     )
     if np.count_nonzero(inlier) < least:
         return matches, 0
     frame.drop_matches(matched[~inlier])
     frame.set_camera_pose(T_camera_w)
     return matches, refine(frame, frame.T_cw, context)
+
+
+def sampled_pose(
+    frame: Frame,
+    feature: NDArray[np.integer],
+    points: NDArray[np.float64],
+    context: TrackingContext,
+    *,
+    min_inliers: int,
+    seed: int,
+) -> tuple[Matrix, NDArray[np.bool_]]:
+    """Estimate the pose of a frame from N matches by P3P inside RANSAC (``ransac_pose``). The frame
+    is not changed.
+
+    Args:
+        feature: ``(N,)`` indices of the matched features.
+        points: ``(N, 3)`` points of the matches, in the world frame.
+        min_inliers: least number of inliers of an acceptable pose.
+        seed: seed of the random samples.
+
+    Returns:
+        The ``(4, 4)`` pose ``T_camera_w`` of the camera that took the image of the features, and an
+        ``(N,)`` bool mask of the inliers. There may be fewer inliers than ``min_inliers``.
+    """
+    config = context.config.relocalization
+    return ransac_pose(
+        points,
+        *observations(frame, feature, context),
+        context.camera.intrinsics,
+        np.uint64(seed),
+        min_inliers,
+        config.max_draws,
+        config.confidence,
+    )
 
 
 def _match_previous(

@@ -10,7 +10,6 @@ import pytest
 from scipy.io import savemat
 from siamese_worlds import views
 
-from vslam.datasets.image_files import is_image
 from vslam.errors import InputError, UnreadableImageError
 from vslam.geometry import se3_exp
 from vslam.loopclosure.siamese.image_source import images_in, read_loop_matrix, undistorted
@@ -27,6 +26,7 @@ from vslam.loopclosure.training.data import (
     write_pairs,
 )
 from vslam.trajectory import write_kitti
+from vslam.untrusted import is_image
 
 
 def write_image(path, grey=100, size=(48, 32)):

@@ -22,6 +22,7 @@ MOST_PIXELS = 2**27
 """Largest number of pixels of an image file (11,585 x 11,585). OpenCV itself allows eight times as
 many pixels."""
 
+_IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 _OPENCV_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
 _ANY_SIZE = 2**27  # bytes; any archive may unpack to this size
 _MOST_PACKED = 20  # a larger archive must have at least 1/20 of its unpacked size
@@ -31,6 +32,11 @@ ARCHIVE_ERRORS = (
 )  # fmt: skip
 """Exceptions that NumPy, zipfile and zlib raise for a file that is not an archive of arrays, is
 damaged or encrypted, or has an unknown compression method."""
+
+
+def is_image(path: Path) -> bool:
+    """Return whether a file has the suffix of an image format. Hidden files are no images."""
+    return path.suffix.lower() in _IMAGE_SUFFIXES and not path.name.startswith(".")
 
 
 def limit_images() -> None:

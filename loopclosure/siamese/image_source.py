@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError
 from vslam.loopclosure.siamese.images import Fit, Size, read_grey, to_size
+from vslam.untrusted import is_image
 
 SAME, UNKNOWN, DIFFERENT = 1, 0, -1
-# The same files as for runs (vslam.datasets.image_files, which this package may not import).
-_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 _NO_TRUTH = (
     "{}: contains no ground truth (a square matrix with at least one match); give the loop matrix "
     "of these images."
@@ -98,7 +97,7 @@ def images_in(folder: Path) -> list[Path]:
     if there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES and p.name[0] != ".")
+    return sorted(filter(is_image, folder.iterdir()))
 
 
 def names_of(files: Iterable[Path]) -> tuple[str, ...]:

@@ -139,7 +139,7 @@ def info(
 def _find_images(images: list[str]) -> list[Path]:
     import glob
 
-    from vslam.datasets.image_files import is_image
+    from vslam.untrusted import is_image
 
     found: dict[Path, None] = {}
     for name in images:

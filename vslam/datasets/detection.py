@@ -8,10 +8,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from vslam.datasets.euroc import is_euroc
-from vslam.datasets.image_files import is_image
 from vslam.datasets.image_folders import has_images
 from vslam.datasets.tum import is_tum
 from vslam.errors import InputError
+from vslam.untrusted import is_image
 
 _BAG_SUFFIXES = {".bag", ".mcap", ".db3"}
 _TEXTS = {".txt", ".csv", ".yaml", ".yml", ".json", ".md", ".py", ".html"}

@@ -17,12 +17,11 @@ from vslam.camera import Camera, DepthImage, Image
 from vslam.datasets.association import Pairing
 from vslam.datasets.frames import RawSource, Size, TimedFrame, check_selection, decoded
 from vslam.errors import InputError, UnreadableImageError
-from vslam.untrusted import MOST_PIXELS, require_utf8
+from vslam.untrusted import MOST_PIXELS, is_image, require_utf8
 
 # Distance in metres between the projector and the camera of a Kinect (ORB-SLAM2, section III-A).
 _VIRTUAL_BASELINE = 0.08
 _Time = TypeVar("_Time", int, float)
-_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
 
 
 def checked_files(
@@ -117,11 +116,6 @@ def list_images(folder: Path) -> dict[str, Path]:
                 "remove one of them."
             )
     return images
-
-
-def is_image(path: Path) -> bool:
-    """Return whether a file has the suffix of an image format."""
-    return path.suffix.lower() in _SUFFIXES and not path.name.startswith(".")
 
 
 def read_image_list(

@@ -1,11 +1,11 @@
 """Measure how tracking copes with fast motion, by using only every N-th frame of a sequence.
 
     python tools/experiments/performance/fast_motion.py --every 3 4 5 --out fast.csv \\
-      --source "--dataset kitti --data $KITTI_ROOT --seq 00 --max-frames 216"
+      --source "00=--dataset kitti --data $KITTI_ROOT --seq 00 --max-frames 216"
 
-A source is a list of options of ``vslam run``. Each run is made twice: with the attempt to find the
-pose after a sudden turn (``track_sudden_motion``), and without this attempt. The table has a row
-for each pair of runs.
+A source is a name for the table and a list of options of ``vslam run``. Each run is made twice:
+with the attempt to find the pose after a sudden turn (``track_sudden_motion``), and without this
+attempt. The table has a row for each pair of runs.
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ WAYS = {"without": ["--config", "tracking.sudden_min_inlier_ratio=1"], "with": [
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--source", action="append", required=True, metavar="OPTIONS")
+    parser.add_argument("--source", action="append", required=True, metavar="NAME=OPTIONS")
     parser.add_argument("--every", type=int, nargs="+", required=True, metavar="N")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    rows = [row(source.split(), every) for source in options.source for every in options.every]
+    sources = [source.partition("=") for source in options.source]
+    rows = [row(name, source.split(), n) for name, _, source in sources for n in options.every]
     with options.out.open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, rows[0], lineterminator="\n")
         table.writeheader()
         table.writerows(rows)
 
 
-def row(source: list[str], every: int) -> dict[str, object]:
+def row(name: str, source: list[str], every: int) -> dict[str, object]:
     reports = {way: run(source, every, options) for way, options in WAYS.items()}
     made: dict[str, object] = {
-        "sequence": source[source.index("--seq") + 1] if "--seq" in source else "fr1/desk",
+        "sequence": name,
         "every": every,
         "frames": reports["with"]["frames"],
     }

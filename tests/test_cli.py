@@ -23,7 +23,9 @@ from vslam import machine
 from vslam.cli import main as cli
 from vslam.cli import options, train
 from vslam.cli import run as run_command
+from vslam.config import PRESETS, as_config, changed_thresholds, thresholds_in_words
 from vslam.datasets import open_sequence, png
+from vslam.errors import InputError
 from vslam.features import TrackingState, TrackResult
 from vslam.loopclosure.registry import DETECTORS
 from vslam.loopclosure.siamese.weights import NETWORKS
@@ -148,7 +150,8 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--detector bow --weights no.npz", ["--weights no.npz", "vocabulary"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("--dataset kitti", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
-        ("--config nothing.json", ["nothing.json", "configuration"]),
+        ("--config nothing.json", ["nothing.json", "no file and no preset"]),
+        ("--config fats", ["did you mean fast?", "the presets are: fast"]),
         ("--compare none --detector none", ["--compare none", "give another"]),
         ("--keep-open --view native", ["--keep-open: only for --view web"]),
         ("--compare both,bow --detector bow", ["--compare bow", "give another"]),
@@ -282,6 +285,22 @@ def test_thresholds_are_given_as_values_too(call, tmp_path):
     file = tmp_path / "a=b.json"
     file.write_text('{"tracking.method": "patches"}')
     assert options.read_thresholds(str(file)).tracking.method == "patches"
+
+
+def test_a_preset_sets_several_thresholds_and_later_values_replace_its_own():
+    for name, thresholds in PRESETS.items():
+        assert changed_thresholds(options.read_thresholds(name).model_dump()) == thresholds
+        assert as_config(name) == options.read_thresholds(name)
+    found = options.read_thresholds("fast, orb.n_features=900")
+    assert found.orb.n_features == 900
+    assert found.mapping.neighbours == PRESETS["fast"]["mapping.neighbours"]
+    assert options.read_thresholds("orb.n_features=900,fast") == as_config("fast")
+    changed = changed_thresholds(options.read_thresholds("fast,orb.n_levels=7").model_dump())
+    assert thresholds_in_words(changed) == "preset=fast, orb.n_levels=7"
+    changed = changed_thresholds(found.model_dump())
+    assert thresholds_in_words(changed).startswith("orb.n_features=900")
+    with pytest.raises(InputError, match="no preset 'slow'"):
+        as_config("slow")
 
 
 def commands(group: Any, words: str = "vslam") -> Iterator[tuple[str, Any]]:

@@ -1,6 +1,6 @@
 """Measure the speed of vslam and ORB-SLAM3 (pyorbslam3) and write the results as Markdown.
 
-    python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" [--also capsule] \
+    python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" [--also="--detector both"] \
         [--repeats 3] [--write docs/research/performance.md] [--csv docs/research/performance.csv] \
         [--orbslam3-python PY --vocabulary voc.txt]
 
@@ -9,7 +9,7 @@ alternately, and never at the same time. The first round is not counted. In each
 
 - with its report,
 - with ``--no-report``,
-- with ``--no-report`` and each detector of ``--also`` instead of ``bow``,
+- with ``--no-report`` and the options of each ``--also``,
 - in the last round, with ``--realtime``. This run takes as long as the drive.
 
 The script keeps the beginning of the page and the section "Limits", which are written by hand.
@@ -39,6 +39,7 @@ VSLAM = str(Path(sys.executable).with_name("vslam"))
 SCRIPT = Path(__file__).parents[1] / "vslam" / "lab" / "stress" / "orbslam3.py"
 PACKAGE = "pyorbslam3"
 LOOP_MESSAGE = "*Loop detected"  # ORB-SLAM3 prints it once for each loop that it closes
+ORBSLAM3_FILES = ("ORBSLAM3_PYTHON", "ORBSLAM3_VOCABULARY")  # variables of tools/figures.toml
 FULL, LEAN, LIVE, ORBSLAM3 = "vslam", "vslam --no-report", "vslam --realtime", "ORB-SLAM3"
 HEAD = """## How it was measured
 
@@ -247,10 +248,10 @@ def measure_case(
     """
     runs: dict[str, list[Run]] = {FULL: [], ORBSLAM3: [], LEAN: [], LIVE: []}
     words = {FULL: (), LEAN: ("--no-report",), LIVE: ("--no-report", "--realtime")}
-    for name in also:
-        runs[title := f"{LEAN} --detector {name}"] = []
-        # This option replaces the --detector of run_vslam, because the last --detector counts.
-        words[title] = ("--no-report", "--detector", name)
+    for options in also:
+        runs[title := f"{LEAN} {options}"] = []
+        # A --detector here replaces the --detector of run_vslam, because the last one counts.
+        words[title] = ("--no-report", *shlex.split(options))
     if orbslam3 is None:
         del runs[ORBSLAM3]
     for repeat in range(repeats + 1):
@@ -442,7 +443,7 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--case", type=parse_case, action="append", required=True, metavar=shape)
     parser.add_argument("--repeats", type=int, default=3, help="counted runs of each system")
     parser.add_argument(
-        "--also", action="append", default=[], metavar="DETECTOR", help="another detector to run"
+        "--also", action="append", default=[], metavar="OPTIONS", help="more options to run with"
     )
     # Paths must be absolute, because each run has its own working folder. Symbolic links are kept,
     # because the link to the interpreter determines its virtual environment.
@@ -472,9 +473,10 @@ def setting_of(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) ->
     )
 
 
-def anonymous(command: str) -> str:
-    """Remove the paths of this machine from a command."""
-    for name in ("KITTI_ROOT", "HOME"):
+def anonymous(words: list[str]) -> str:
+    """Return a command with variables instead of the paths of this machine."""
+    command = shlex.join(words).replace("'", '"')  # variables are expanded in double quotes only
+    for name in ("KITTI_ROOT", "KITTI_AS_PNG", "TOWNS", *ORBSLAM3_FILES, "HOME"):
         if path := os.environ.get(name, "").rstrip("/"):
             command = command.replace(path, f"${name}")
     return command
@@ -524,7 +526,7 @@ def main() -> None:
     setting += f" The load of the machine was {load:.1f} when the command began."
     text = "\n".join((
         HEAD, *sections, f"## Setting\n\n{setting}\n",
-        f"```sh\npython {anonymous(shlex.join(sys.argv))}\n```\n",
+        f"```sh\npython {anonymous(sys.argv)}\n```\n",
     ))  # fmt: skip
     if options.write:
         above, below = written(options.write)

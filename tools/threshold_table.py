@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from pydantic import BaseModel
 
-from vslam.config import Config
+from vslam.config import PRESETS, Config
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "thresholds.md"
 DESCRIPTION = re.compile(
@@ -26,11 +26,12 @@ DESCRIPTION = re.compile(
 )
 HEAD = """# Thresholds
 
-This page lists all thresholds of vslam. `python tools/threshold_table.py` generates it from `vslam/config.py`, and `tests/test_threshold_table.py` checks that the two agree. [The design](../explanation/design.md) describes the methods in which the thresholds are used. There are three ways to change a threshold:
+This page lists all thresholds of vslam. `python tools/threshold_table.py` generates it from `vslam/config.py`, and `tests/test_threshold_table.py` checks that the two agree. [The design](../explanation/design.md) describes the methods in which the thresholds are used. There are four ways to change thresholds:
 
 - In a JSON file: `vslam run --config FILE`, with `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}` in the file.
 - On the command line: `vslam run --config orb.n_features=1500,tracking.method=patches`.
 - In Python: `Slam(camera, config={"orb.n_features": 1500})`.
+- With a [preset](#presets): `vslam run --config fast`, or `Slam(camera, config="fast")`. Single values can follow: `--config fast,orb.n_features=1000`.
 
 The column *source* names the paper and the section of the rule in which the threshold is used. It also states where the value comes from:
 
@@ -106,7 +107,22 @@ def page(config: Config) -> str:
             for row in rows(config, section)
         ]
         lines += [""]
-    return "\n".join(lines).rstrip("\n") + "\n"
+    return "\n".join([*lines, *presets()])
+
+
+def presets() -> list[str]:
+    """Return the lines of the section on presets."""
+    lines = [
+        "## Presets\n",
+        "A preset sets several thresholds. All others keep their defaults. The preset `fast` "
+        "trades accuracy for speed ([measurements](../research/performance.md#the-preset-fast)).\n",
+        "| preset | thresholds |",
+        "|---|---|",
+    ]
+    for name, thresholds in PRESETS.items():
+        values = ", ".join(f"`{key}={value}`" for key, value in thresholds.items())
+        lines.append(f"| `{name}` | {values} |")
+    return [*lines, ""]
 
 
 if __name__ == "__main__":

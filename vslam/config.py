@@ -793,6 +793,18 @@ class Config(Section):
         return nested
 
 
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "fast": {
+        "orb.n_features": 1200,
+        "keyframes.patch_kept_close": 0.3,
+        "keyframes.merge_after_frames": 3,
+        "mapping.neighbours": 5,
+    }
+}
+"""Thresholds by the name of the preset, and by dotted name. ``fast`` trades accuracy for speed
+(docs/research/performance.md)."""
+
+
 def load_config(path: Path | str) -> Config:
     """Read thresholds from a JSON file. Keys that the file omits keep their defaults.
 
@@ -803,18 +815,38 @@ def load_config(path: Path | str) -> Config:
     return read_json(Config, Path(path), "configuration")
 
 
-def as_config(given: Config | Mapping[str, Any], where: str = "config") -> Config:
-    """Check thresholds that are given as a dictionary, in the form of ``config.json``.
+def as_config(given: Config | Mapping[str, Any] | str, where: str = "config") -> Config:
+    """Check thresholds that are given as a dictionary, in the form of ``config.json``, or by the
+    name of a preset.
 
     Args:
-        given: thresholds by section or by dotted name. Thresholds that are left out keep their
-            defaults. A ``Config`` is returned unchanged.
+        given: thresholds by section or by dotted name, or a name from ``PRESETS``. Thresholds that
+            are left out keep their defaults. A ``Config`` is returned unchanged.
         where: the file or argument that the thresholds come from, for error messages.
 
     Raises:
-        InputError: a key is unknown, or a value is out of range.
+        InputError: a preset or a key is unknown, or a value is out of range.
     """
+    if isinstance(given, str):
+        given = preset(given, where)
     return checked(Config, given, where, "configuration")
+
+
+def preset(name: str, where: str) -> Mapping[str, Any]:
+    """Return the thresholds of a preset, by dotted name.
+
+    Args:
+        where: the argument that contains the name, for error messages.
+
+    Raises:
+        InputError: there is no such preset.
+    """
+    if name not in PRESETS:
+        raise InputError(
+            f"{where}: there is no file and no preset {name!r}{did_you_mean(name, PRESETS)}; the "
+            f"presets are: {', '.join(PRESETS)}."
+        )
+    return PRESETS[name]
 
 
 def changed_thresholds(config: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -833,14 +865,28 @@ def changed_thresholds(config: Mapping[str, Mapping[str, Any]]) -> dict[str, Any
     }
 
 
+def with_preset(changed: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace the thresholds of a preset with one entry, such as ``{"preset": "fast"}``.
+
+    Args:
+        changed: thresholds by dotted name. If they do not contain a whole preset, they are returned
+            as they are.
+    """
+    for name, thresholds in PRESETS.items():
+        if thresholds.items() <= changed.items():
+            others = {key: changed[key] for key in changed if key not in thresholds}
+            return {"preset": name, **others}
+    return dict(changed)
+
+
 def thresholds_in_words(changed: Mapping[str, Any], most: int = 3) -> str:
     """Describe thresholds in a short text, such as ``orb.n_features=1000, 2 more in config.json``.
 
     Args:
-        changed: thresholds by dotted name.
+        changed: thresholds by dotted name. A preset is described by its name.
         most: greatest number of thresholds that are listed. The others are only counted.
     """
-    words = [f"{name}={value}" for name, value in changed.items()]
+    words = [f"{name}={value}" for name, value in with_preset(changed).items()]
     more = [f"{len(words) - most} more in config.json"] if len(words) > most else []
     return ", ".join(words[:most] + more)
 

@@ -73,7 +73,7 @@ class Slam:
     def __init__(
         self,
         camera: Camera,
-        config: Config | Mapping[str, Any] | None = None,
+        config: Config | Mapping[str, Any] | str | None = None,
         detector: LoopDetector | str = DEFAULT_DETECTOR,
         *,
         threads: int = 2,
@@ -87,8 +87,9 @@ class Slam:
         Args:
             camera: the rectified camera that the images come from. Use ``camera.left_camera()`` for
                 monocular SLAM.
-            config: thresholds, as a ``Config`` or as a dictionary such as ``{"orb": {"n_features":
-                1000}}``. Thresholds that are left out keep their defaults.
+            config: thresholds, as a ``Config``, as a dictionary such as ``{"orb": {"n_features":
+                1000}}``, or as the name of a preset, such as ``"fast"``. Thresholds that are left
+                out keep their defaults.
             detector: proposes loop candidates, and places for relocalisation. It is an object or a
                 name (``vslam.loopclosure.registry``). ``both`` combines the capsule network with
                 the bag of words. ``none`` closes no loops.
@@ -105,7 +106,7 @@ class Slam:
 
         Raises:
             ValueError: the map cannot be continued. The message gives the reason in a few words.
-            InputError: a threshold is unknown or out of range.
+            InputError: a preset or threshold is unknown, or a value is out of range.
         """
         config = as_config({} if config is None else config)
         if isinstance(detector, str):
@@ -133,7 +134,7 @@ class Slam:
     def load(
         cls,
         path: Path | str,
-        config: Config | Mapping[str, Any] | None = None,
+        config: Config | Mapping[str, Any] | str | None = None,
         detector: LoopDetector | str | None = None,
         *,
         resume: bool = False,

@@ -74,9 +74,10 @@ Thresholds = Annotated[
     str | None,
     option(
         METHOD,
-        "FILE|NAME=VALUE",
+        "FILE|fast|NAME=VALUE",
         "Thresholds: a JSON file, such as the config.json of a run, or values separated by "
-        "commas, such as orb.n_features=1000 (docs/reference/thresholds.md).",
+        "commas, such as orb.n_features=1000 (docs/reference/thresholds.md). [b]fast[/b] trades "
+        "accuracy for speed.",
         "--config",
     ),
 ]
@@ -352,17 +353,23 @@ def kind_of_source(options: SourceOptions) -> str:
 
 
 def read_thresholds(given: str | None) -> Config:
-    """Read the thresholds of ``--config``: a file, or a text with values. None gives the
-    defaults."""
-    from vslam.config import Config, as_config, load_config
+    """Read the thresholds of ``--config``: a file, or a text with presets and values, of which
+    later ones replace earlier ones. None gives the defaults."""
+    from vslam.config import Config, as_config, load_config, preset
 
     if given is None:
         return Config()
-    if "=" not in given or Path(given).exists():
+    if Path(given).exists():
         return load_config(given)
-    pairs = (pair.partition("=") for pair in given.split(","))
-    values = {name.strip(): value.strip() for name, _, value in pairs}
-    return as_config(values, f"--config {given}")
+    where = f"--config {given}"
+    thresholds: dict[str, Any] = {}
+    for part in given.split(","):
+        name, equals, value = part.partition("=")
+        if equals:
+            thresholds[name.strip()] = value.strip()
+        else:
+            thresholds.update(preset(name.strip(), where))
+    return as_config(thresholds, where)
 
 
 def open_given(options: SourceOptions, console: Console) -> Source:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vslam.config import changed_thresholds
+from vslam.config import changed_thresholds, with_preset
 from vslam.errors import InputError, counted
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.lab.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
@@ -219,7 +219,7 @@ def _settings(report: ReportJson, folder: Path) -> dict[str, Any]:
     options = {name: getattr(report, name) for name in _OPTIONS}
     options["calib"] = " ".join(map(str, report.calib))
     options["method"] = report.versions.get("method")
-    return changed | {name: str(value) for name, value in options.items() if value}
+    return with_preset(changed) | {name: str(value) for name, value in options.items() if value}
 
 
 def _name_by_settings(found: Found) -> None:

@@ -193,7 +193,11 @@ def test_a_table_without_a_stamp_or_a_command_is_a_fault(figures, made):
         ("12, 2.5", "2.5", "'2.5' differs from"),
         ("7, none", "7, 0.1", "'7, 0.1' differs from [7.0]"),
         ("617.3 m", "617.9 m", "does not mention 617.3117 of docs/research/drives.csv"),
-        ("| b |", "| c |", "0 rows of drives.csv have {'drive': 'c', 'system': 'ours'}"),
+        (
+            "| b |",
+            "| c |",
+            "0 rows of docs/research/drives.csv have {'drive': 'c', 'system': 'ours'}",
+        ),
         ("drives.csv | drive=$1", "none.csv | drive=$1", "cannot be read"),
         ("ate_m (system=ours)", "ate (system=ours)", "cannot be read: 'ate'"),
     ],
@@ -202,6 +206,21 @@ def test_a_page_that_differs_from_its_source_is_found(figures, made, shown, inst
     assert PAGE.count(shown) == 1
     (found,) = figures.sources.compare(PAGE.replace(shown, instead), made)
     assert fault in found
+
+
+def test_a_table_may_join_the_rows_of_several_files(figures, made):
+    drives = made / "docs/research/drives.csv"
+    head, *rows = drives.read_text().splitlines(keepends=True)
+    drives.write_text(head + "".join(row for row in rows if ",ours," in row))
+    other = made / "docs/research/other.csv"
+    other.write_text(head + "".join(row for row in rows if ",ours," not in row))
+    page = PAGE.replace("drives.csv | drive=$1", "drives.csv + docs/research/other.csv | drive=$1")
+    assert list(figures.sources.compare(page, made)) == []
+    comment = figures.sources.COMMENT.findall(page)[0]
+    assert figures.sources.files_of(comment) == {
+        "docs/research/drives.csv",
+        "docs/research/other.csv",
+    }
 
 
 def test_a_table_made_by_other_means_is_stamped_with_its_version(figures, made):

@@ -7,7 +7,7 @@ row of the table. The last line also describes all further rows::
 
 The fields of a line, separated by ``|``, are:
 
-- The CSV file.
+- The CSV file, or several files separated by ``+``, whose rows are joined.
 - A filter that selects a row of the file. ``$1`` stands for the text of the first cell of the
   table's row. If a part of this text is in backticks, ``$1`` stands for that part. ``$0`` stands
   for the head of the column.
@@ -43,7 +43,8 @@ def lines_of(comment: str) -> list[str]:
 
 def files_of(comment: str) -> set[str]:
     """Return the CSV files that a comment names as sources of a table."""
-    return {line.partition("|")[0].strip() for line in lines_of(comment)} - {"-"}
+    fields = (line.partition("|")[0] for line in lines_of(comment))
+    return {file.strip() for field in fields for file in field.split(" + ")} - {"-"}
 
 
 def untraced(text: str) -> tuple[int, int]:
@@ -83,7 +84,7 @@ def _row_faults(line: str, head: list[str], row: list[str], root: Path) -> Itera
     file, filters, *columns = [part.strip() for part in line.split("|")]
     columns += columns[-1:] * (len(row) - len(columns))
     for name, cell, column in zip(head, row, columns, strict=True):
-        values = _values(root / file, filters, column, [name, *row]) if column else []
+        values = _values(root, file, filters, column, [name, *row]) if column else []
         left, numbers = cell, []
         for value in values:
             if isinstance(value, str):
@@ -101,7 +102,7 @@ def _row_faults(line: str, head: list[str], row: list[str], root: Path) -> Itera
 def _paragraph_faults(line: str, paragraph: str, root: Path) -> Iterator[str]:
     file, filters, column = [part.strip() for part in line.split("|")]
     shown = NUMBER.findall(paragraph)
-    for value in _values(root / file, filters, column, []):
+    for value in _values(root, file, filters, column, []):
         if isinstance(value, str):
             found = value in paragraph
         else:
@@ -116,13 +117,15 @@ def _is_rounded(shown: str, value: float) -> bool:
     return abs(float(number) - value) <= 0.5 * 10.0**-decimals * (1 + 1e-6)
 
 
-def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float | str]:
-    """Return the numbers and texts of the CSV file that a cell of a table must show.
+def _values(root: Path, files: str, filters: str, column: str, row: list[str]) -> list[float | str]:
+    """Return the numbers and texts of the CSV files that a cell of a table must show.
 
     ``row`` contains the head of the cell's column, followed by all cells of the row.
     """
-    with path.open(newline="", encoding="utf-8") as file:
-        table = list(csv.DictReader(file))
+    table = []
+    for name in files.split(" + "):
+        with (root / name).open(newline="", encoding="utf-8") as file:
+            table += list(csv.DictReader(file))
     found: list[float | str] = []
     in_parentheses = ""
     for field in reversed(column.split(";")):
@@ -134,7 +137,7 @@ def _values(path: Path, filters: str, column: str, row: list[str]) -> list[float
         if over in OVER_ROWS and rows:
             found.append(OVER_ROWS[over]([float(one[summed]) for one in rows]))
         elif len(rows) != 1:
-            raise LookupError(f"{len(rows)} rows of {path.name} have {wanted}")
+            raise LookupError(f"{len(rows)} rows of {files} have {wanted}")
         elif value := rows[0][name]:
             found.append(float(value) if NUMBER.fullmatch(value) else value)
     return found[::-1]

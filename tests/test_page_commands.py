@@ -185,7 +185,6 @@ RULES = {
     "docs/research/loops.md": Rules(
         not_run=(
             ("vslam loops bench", "it takes hours; test_loopbench.py runs it on a small town"),
-            ("vslam bench", HOURS),
         )
     ),
     "docs/howto/maps.md": Rules(

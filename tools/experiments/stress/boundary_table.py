@@ -1,8 +1,8 @@
-"""Print the boundaries of two systems side by side, from a ``boundaries.csv`` of ``vslam stress``.
+"""Print the boundaries of two systems side by side, from the tables of ``vslam stress``.
 
 The boundary of a system is the strength of a perturbation at which it fails.
 
-python tools/experiments/stress/boundary_table.py docs/research/stress/kitti00.csv bow orbslam3
+python tools/experiments/stress/boundary_table.py stress/boundaries.csv --systems bow orbslam3
 """
 
 from __future__ import annotations
@@ -16,10 +16,12 @@ from vslam.datasets.perturbation import LAWS
 NAMES = {"bow": "vslam", "orbslam3": "ORB-SLAM3"}
 
 
-def table(path: Path, ours: str, theirs: str) -> str:
+def table(paths: list[Path], ours: str, theirs: str) -> str:
     """Return a Markdown table of the boundaries of the two systems, by perturbation."""
-    with path.open(newline="") as file:
-        rows = {(row["law"], row["system"]): row for row in csv.DictReader(file)}
+    rows = {}
+    for path in paths:
+        with path.open(newline="") as file:
+            rows |= {(row["law"], row["system"]): row for row in csv.DictReader(file)}
     # In a comparison with another system, the detector bow is called vslam.
     known = NAMES if theirs in NAMES else {}
     names = [known.get(system, f"`{system}`") for system in (ours, theirs)]
@@ -43,8 +45,8 @@ def _cells(row: dict[str, str] | None) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("csv", type=Path)
-    parser.add_argument("systems", nargs=2)
+    parser.add_argument("csv", type=Path, nargs="+", help="files boundaries.csv")
+    parser.add_argument("--systems", nargs=2, required=True)
     args = parser.parse_args()
     print(table(args.csv, *args.systems))
 

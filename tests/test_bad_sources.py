@@ -241,7 +241,7 @@ def test_folders_of_images(folder, corridor, tmp_path):
     times.write_text("0.0\n0.2\n0.1\n")
     refused("left/2.png: its time is not later", "images", tmp_path, options)
     refused("no such folder", "images", tmp_path / "none", options)
-    refused(f"but {tmp_path} has both .name it", "images", tmp_path / "left", options)
+    refused(f"but {tmp_path} has both .give it", "images", tmp_path / "left", options)
     (tmp_path / "calib.txt").write_text("P0: 1")
     refused("sequence of KITTI; .* --seq", "images", tmp_path, SourceOptions(fps=10.0))
     options = SourceOptions(calib=(folder / "stereo.yaml",), right=tmp_path)

@@ -52,7 +52,7 @@ def test_what_is_not_known_is_told_what_was_looked_for(tmp_path):
     with pytest.raises(InputError, match="the folder is empty; give another one"):
         detect_dataset(str(tmp_path))
     (tmp_path / "1.png").touch()
-    with pytest.raises(InputError, match="a single image; name its folder"):
+    with pytest.raises(InputError, match="a single image; give its folder"):
         detect_dataset(str(tmp_path / "1.png"))
     (tmp_path / "1.png").rename(tmp_path / "notes.txt")
     with pytest.raises(InputError) as caught:

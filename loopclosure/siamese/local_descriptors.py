@@ -36,7 +36,7 @@ class LocalDescriptors:
             path: ONNX file of a network that maps an image to coarse and fine descriptors.
         """
         if not path.exists():
-            fix = "install vslam again" if path == SHIPPED_LOCAL else "name another file"
+            fix = "install vslam again" if path == SHIPPED_LOCAL else "give another file"
             raise InputError(f"{path}: the weights of the local descriptors are missing; {fix}.")
         self._path = path
 

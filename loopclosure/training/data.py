@@ -92,7 +92,7 @@ def load(sources: list[ImageSource], size: Size, fit: Fit, threads: int = 2) -> 
     """Decode all images of all sources into memory. An image of 227x227 pixels takes 51 kB."""
     names = [source.name for source in sources]
     if not sources:
-        raise InputError("--data: name at least one source of images.")
+        raise InputError("--data: give at least one source of images.")
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"--data: two sources have the name {twice}; rename a folder.")

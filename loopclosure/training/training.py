@@ -121,7 +121,7 @@ def train(
             finite, the last good checkpoint is kept.
     """
     if settings.learned_share < 1 and start is None:
-        raise InputError("learned_share: needs a network to start from; name it with --weights.")
+        raise InputError("learned_share: needs a network to start from; give it with --weights.")
     torch_device = open_device(device)
     half = _mixed_precision(settings, torch_device)
     check_emphasis(collection, settings.emphasis)

@@ -120,7 +120,7 @@ def read_document(path: Path) -> Document:
         ) from error
     if too_large:
         raise InputError(
-            f"{path}: is larger than {_MOST_BYTES // 1000} kB, so it is not a calibration; name "
+            f"{path}: is larger than {_MOST_BYTES // 1000} kB, so it is not a calibration; give "
             "another file."
         )
     if not text.strip():

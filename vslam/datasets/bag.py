@@ -361,7 +361,7 @@ def _choose_topics(
             raise InputError(f"{path}: choose topics with --topics {wanted}; {listed}.")
     if not n <= len(topics) <= 2:
         raise InputError(
-            f"--topics {','.join(topics)}: name the topic of the left images and the topic of the "
+            f"--topics {','.join(topics)}: give the topic of the left images and the topic of the "
             "right images or of the depth, or run with --sensor mono."
         )
     if len(set(topics)) < len(topics):

@@ -66,9 +66,9 @@ def detect_dataset(data: str) -> str:
         return "camera"
     path = Path(data)
     if path.is_file() and is_image(path):
-        raise InputError(f"{data}: a single image; name its folder with --data.")
+        raise InputError(f"{data}: a single image; give its folder with --data.")
     if path.is_file() and path.suffix.lower() in _ARCHIVES:
-        raise InputError(f"{data}: an archive; unpack it and name the folder with --data.")
+        raise InputError(f"{data}: an archive; unpack it and give the folder with --data.")
     if path.is_file() and path.suffix.lower() in _TEXTS:
         raise InputError(
             f"{data}: not images; give a folder of images, a video or a bag with --data."
@@ -81,7 +81,7 @@ def detect_dataset(data: str) -> str:
             return kind
         looked = "; ".join(f"{what} ({kind})" for kind, what, _ in _KINDS)
         raise InputError(
-            f"{data}: not a known data set{_nearest(path)}; name its kind with --dataset. Looked "
+            f"{data}: not a known data set{_nearest(path)}; give its kind with --dataset. Looked "
             f"for {looked}."
         )
     if data.isdecimal():

@@ -135,7 +135,7 @@ def _find(root: Path, name: str | None) -> tuple[Path, str]:
     if folder is None:
         raise InputError(
             f"{root}: holds no data in EuRoC's layout (no mav0/cam0/data.csv); download a sequence "
-            f"in ASL format from {_HOME}, unpack it and name its folder with --data."
+            f"in ASL format from {_HOME}, unpack it and give its folder with --data."
         )
     base = folder / "mav0" if (folder / "mav0").is_dir() else folder
     return base, folder.resolve().name

@@ -188,7 +188,7 @@ def _near_miss(folder: Path) -> str:
     above = folder.resolve().parent
     for names in PAIRS + DEPTH_PAIRS:
         if all(list_images(above / name) for name in names) and folder.resolve().name in names:
-            return f", but {above} has both (name it with --data)"
+            return f", but {above} has both (give it with --data)"
         sides = [bool(list_images(folder / name)) for name in names]
         if any(sides):
             there, missing = names if sides[0] else names[::-1]
@@ -247,7 +247,7 @@ def _paired_by_time(
     if not len(pairs[0]):
         raise InputError(
             f"{files[1][0].parent}: by the times in their names, no depth image is within 20 ms of "
-            "an image; name folders of one recording."
+            "an image; give folders of one recording."
         )
     fix = "correct the names if the times of one folder are late, or run with --sensor mono"
     pairing = Pairing(files[0][0].parent, "depth image", DEPTH_NEAR_S, fix)

@@ -163,7 +163,7 @@ def _find_root(root: Path | str) -> Path:
     raise InputError(
         f"{root}: holds no KITTI odometry data (no folder 'sequences'); download the grayscale "
         f"images (22 GB), calibration files and ground truth poses from {_HOME}, unpack them into "
-        "one folder and name it with --data or $KITTI_ROOT; --dataset synthetic needs no download."
+        "one folder and give it with --data or $KITTI_ROOT; --dataset synthetic needs no download."
     )
 
 

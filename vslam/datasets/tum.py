@@ -86,7 +86,7 @@ def open_tum(
     if folder is None:
         raise InputError(
             f"{root}: holds no data in TUM's RGB-D layout (no rgb.txt); download a sequence from "
-            f"{_HOME}, unpack it and name its folder with --data."
+            f"{_HOME}, unpack it and give its folder with --data."
         )
     times, colour_files = _read_list(folder / "rgb.txt")
     frames = partners = np.arange(len(times))

@@ -118,7 +118,7 @@ def require_comparable(name: str, weights: Path | None) -> None:
     if name == "none":
         raise InputError("--detectors none: finds no loops; leave it out.")
     if name == "both":
-        raise InputError("--detectors both: has no score of its own; name bow,capsule.")
+        raise InputError("--detectors both: has no score of its own; give bow,capsule.")
     if name not in DETECTORS:
         known = [one for one in DETECTORS if one not in ("none", "both")]
         raise InputError(

@@ -46,7 +46,7 @@ def open_drives(
         return open_source(spec)
     if kind != "drive":
         raise InputError(
-            f"--data {spec}: --protocol online needs drives; name drive:ROUTE, kitti:DIR or "
+            f"--data {spec}: --protocol online needs drives; give drive:ROUTE, kitti:DIR or "
             "fabmap:DIR."
         )
     from vslam.datasets.synthetic import Variation

@@ -78,7 +78,7 @@ def collect(folders: Collection[Path], trajectories: Collection[str]) -> Found:
             found.truth.setdefault((entry.drive.dataset, entry.drive.place), folder)
     if not found.runs:
         raise InputError(
-            f"{', '.join(map(str, folders))}: no finished run here; name folders that 'vslam run' "
+            f"{', '.join(map(str, folders))}: no finished run here; give folders that 'vslam run' "
             "or 'vslam bench' wrote."
         )
     _name_by_settings(found)
@@ -118,7 +118,7 @@ def run_folders(folders: Collection[Path]) -> list[Path]:
     found: dict[Path, Path] = {}
     for folder in folders:
         if not folder.is_dir():
-            raise InputError(f"{folder}: no such folder; name folders of runs.")
+            raise InputError(f"{folder}: no such folder; give folders of runs.")
         for path in sorted(folder.rglob("report.json")):
             if not any(part.startswith(".") for part in path.relative_to(folder).parts):
                 found.setdefault(path.parent.resolve(), path.parent)

@@ -54,7 +54,7 @@ def list_runs(folders: Collection[Path]) -> list[tuple[Path, ReportJson]]:
             if _is_own(folder / "report.json"):
                 found.append((folder, ReportJson.read(folder / "report.json")))
     if not found:
-        raise InputError(f"{', '.join(map(str, folders))}: no run here; name folders of runs.")
+        raise InputError(f"{', '.join(map(str, folders))}: no run here; give folders of runs.")
     return sorted(found, key=lambda run: (run[1].created, run[0].name), reverse=True)
 
 

@@ -476,7 +476,7 @@ def setting_of(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) ->
 def anonymous(words: list[str]) -> str:
     """Return a command with variables instead of the paths of this machine."""
     command = shlex.join(words).replace("'", '"')  # variables are expanded in double quotes only
-    for name in ("KITTI_ROOT", "KITTI_AS_PNG", "TOWNS", *ORBSLAM3_FILES, "HOME"):
+    for name in ("OUT", "KITTI_ROOT", "KITTI_AS_PNG", "TOWNS", *ORBSLAM3_FILES, "HOME"):
         if path := os.environ.get(name, "").rstrip("/"):
             command = command.replace(path, f"${name}")
     return command

@@ -150,7 +150,7 @@ def refused(result: tuple[int, str, str], *parts: str) -> None:
         ("--detector bow --weights no.npz", ["--weights no.npz", "vocabulary"]),
         ("--dataset synthetic --seq 77", ["synthetic route 77", "choose one of demo"]),
         ("--dataset kitti", ["data/kitti", "cvlibs.net", "--data", "$KITTI_ROOT"]),
-        ("--config nothing.json", ["nothing.json", "no file and no preset"]),
+        ("--config nothing.json", ["nothing.json", "no file or preset"]),
         ("--config fats", ["did you mean fast?", "the presets are: fast"]),
         ("--compare none --detector none", ["--compare none", "give another"]),
         ("--keep-open --view native", ["--keep-open: only for --view web"]),

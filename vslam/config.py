@@ -832,19 +832,20 @@ def as_config(given: Config | Mapping[str, Any] | str, where: str = "config") ->
     return checked(Config, given, where, "configuration")
 
 
-def preset(name: str, where: str) -> Mapping[str, Any]:
+def preset(name: str, where: str, sought: str = "preset") -> Mapping[str, Any]:
     """Return the thresholds of a preset, by dotted name.
 
     Args:
         where: the argument that contains the name, for error messages.
+        sought: what the name may stand for, for error messages.
 
     Raises:
         InputError: there is no such preset.
     """
     if name not in PRESETS:
         raise InputError(
-            f"{where}: there is no file and no preset {name!r}{did_you_mean(name, PRESETS)}; the "
-            f"presets are: {', '.join(PRESETS)}."
+            f"{where}: there is no {sought} {name!r}{did_you_mean(name, PRESETS)}; the presets "
+            f"are: {', '.join(PRESETS)}."
         )
     return PRESETS[name]
 

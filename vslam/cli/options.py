@@ -74,10 +74,10 @@ Thresholds = Annotated[
     str | None,
     option(
         METHOD,
-        "FILE|fast|NAME=VALUE",
-        "Thresholds: a JSON file, such as the config.json of a run, or values separated by "
-        "commas, such as orb.n_features=1000 (docs/reference/thresholds.md). [b]fast[/b] trades "
-        "accuracy for speed.",
+        "FILE|NAME=VALUE",
+        "Thresholds: a JSON file, such as the config.json of a run, values such as "
+        "orb.n_features=1000 (docs/reference/thresholds.md), or [b]fast[/b], which is less "
+        "accurate.",
         "--config",
     ),
 ]
@@ -368,7 +368,7 @@ def read_thresholds(given: str | None) -> Config:
         if equals:
             thresholds[name.strip()] = value.strip()
         else:
-            thresholds.update(preset(name.strip(), where))
+            thresholds.update(preset(name.strip(), where, "file or preset"))
     return as_config(thresholds, where)
 
 

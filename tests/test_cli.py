@@ -291,6 +291,8 @@ def test_a_preset_sets_several_thresholds_and_later_values_replace_its_own():
     for name, thresholds in PRESETS.items():
         assert changed_thresholds(options.read_thresholds(name).model_dump()) == thresholds
         assert as_config(name) == options.read_thresholds(name)
+    many = ",".join(["orb.n_features=800"] * 30)  # longer than the name of a file may be
+    assert options.read_thresholds(many).orb.n_features == 800
     found = options.read_thresholds("fast, orb.n_features=900")
     assert found.orb.n_features == 900
     assert found.mapping.neighbours == PRESETS["fast"]["mapping.neighbours"]

@@ -39,7 +39,10 @@ VSLAM = str(Path(sys.executable).with_name("vslam"))
 SCRIPT = Path(__file__).parents[1] / "vslam" / "lab" / "stress" / "orbslam3.py"
 PACKAGE = "pyorbslam3"
 LOOP_MESSAGE = "*Loop detected"  # ORB-SLAM3 prints it once for each loop that it closes
-ORBSLAM3_FILES = ("ORBSLAM3_PYTHON", "ORBSLAM3_VOCABULARY")  # variables of tools/figures.toml
+# Variables of tools/figures.toml. HOME comes last, because the other paths may begin with it.
+PATHS = (
+    "OUT", "KITTI_ROOT", "KITTI_AS_PNG", "TOWNS", "ORBSLAM3_PYTHON", "ORBSLAM3_VOCABULARY", "HOME",
+)  # fmt: skip
 FULL, LEAN, LIVE, ORBSLAM3 = "vslam", "vslam --no-report", "vslam --realtime", "ORB-SLAM3"
 HEAD = """## How it was measured
 
@@ -476,7 +479,7 @@ def setting_of(report: dict[str, Any], system: OrbSlam3 | None, repeats: int) ->
 def anonymous(words: list[str]) -> str:
     """Return a command with variables instead of the paths of this machine."""
     command = shlex.join(words).replace("'", '"')  # variables are expanded in double quotes only
-    for name in ("OUT", "KITTI_ROOT", "KITTI_AS_PNG", "TOWNS", *ORBSLAM3_FILES, "HOME"):
+    for name in PATHS:
         if path := os.environ.get(name, "").rstrip("/"):
             command = command.replace(path, f"${name}")
     return command

@@ -75,9 +75,8 @@ Thresholds = Annotated[
     option(
         METHOD,
         "FILE|NAME=VALUE",
-        "Thresholds: a JSON file, such as the config.json of a run, values such as "
-        "orb.n_features=1000 (docs/reference/thresholds.md), or [b]fast[/b], which is less "
-        "accurate.",
+        "Thresholds: a JSON file, or values separated by commas, such as orb.n_features=1000 "
+        "(docs/reference/thresholds.md). [b]fast[/b] is faster but less accurate.",
         "--config",
     ),
 ]
@@ -359,7 +358,7 @@ def read_thresholds(given: str | None) -> Config:
 
     if given is None:
         return Config()
-    if Path(given).exists():
+    if os.path.exists(given):  # unlike Path.exists, it accepts a text of any length
         return load_config(given)
     where = f"--config {given}"
     thresholds: dict[str, Any] = {}

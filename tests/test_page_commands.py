@@ -246,7 +246,7 @@ RULES = {
     "docs/research/stress.md": Rules(
         (
             ("--laws all", "--laws night --seeds 1 --steps 1"),
-            (r"(docs/research/stress/\w+.csv bow)", r"tools/../\1"),  # tools is a link
+            (r" (docs/research/stress/\w+.csv)", r" tools/../\1"),  # tools is a link
         ),
         (
             ("vslam stress --dataset synthetic --seqs demo --laws all", HOURS),

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import Config
+from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.kitti import open_kitti
 from vslam.datasets.perturbation import LAWS, parse_perturbation, sheet_of_laws
 from vslam.errors import InputError
@@ -22,6 +24,7 @@ from vslam.lab.stress.criterion import Criterion, absolute_verdict
 from vslam.lab.stress.external import check_template, export_kitti, run_external
 from vslam.lab.stress.figures import draw_curves
 from vslam.lab.stress.kitti_c import CORRUPTIONS
+from vslam.lab.stress.orbslam3 import _moved_with_keyframes
 from vslam.lab.stress.plan import Plan, parse_laws
 from vslam.lab.stress.report import boundary_sections, render_csv, title, write_report
 from vslam.lab.stress.report import cell as cell_text
@@ -467,6 +470,56 @@ def test_the_exported_folder_is_read_again(tmp_path):
     left, right = again.read(3)
     np.testing.assert_array_equal(left, sequence.read(3)[0])
     np.testing.assert_array_equal(right, np.rint(sequence.read(3)[1] / 2.0))
+
+
+def test_a_single_camera_is_exported_without_right_images(tmp_path):
+    sequence = open_kitti(make_kitti(tmp_path / "data"), "00", monocular=True)
+    export_kitti(sequence, parse_perturbation("none", 0), tmp_path / "out")
+    assert len(list((tmp_path / "out" / "image_0").iterdir())) == 12
+    assert not (tmp_path / "out" / "image_1").exists()
+
+
+def test_depth_is_exported_in_millimetres(tmp_path):
+    import cv2
+
+    depth = np.full((48, 64), 1.2344, np.float32)
+    depth[0, :4] = 0.0, 65.6, np.inf, np.nan
+    frames = [TimedFrame(0.5, lambda _map: (np.zeros((48, 64), np.uint8), depth))]
+    camera = Camera(100.0, 100.0, 32.0, 24.0, baseline=0.08, width=64, height=48, depth=True)
+    sequence = Source(dataset="tum", name="d", camera=camera, stored=tuple(frames))
+    export_kitti(sequence, parse_perturbation("none", 0), tmp_path)
+    written = cv2.imread(str(tmp_path / "depth" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    assert written.dtype == np.uint16
+    assert written[0, :5].tolist() == [0, 0, 0, 0, 1234]
+    assert not (tmp_path / "image_1").exists()
+
+
+def test_the_costs_of_another_system_are_those_it_writes(tmp_path):
+    root = make_kitti(tmp_path)
+    costs = '(out / "costs.json").write_text(\'{"wall_s": 2.0, "cpu_s": 3.0}\')\n'
+    report = run_script(root, DRIVES + costs)
+    assert (report.fps, report.cpu_ms_per_frame) == (6.0, 250.0)
+    with pytest.raises(InputError, match="is malformed"):
+        run_script(root, DRIVES + '(out / "costs.json").write_text("[1]")\n')
+
+
+def test_frames_move_with_the_last_corrected_keyframe(tmp_path):
+    def pose(x: float) -> np.ndarray:
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_rotvec([0.1, -2.0, 0.3]).as_matrix()
+        T[0, 3] = x
+        return T
+
+    correction = np.eye(4)
+    correction[:3, :3] = Rotation.from_rotvec([0.0, 0.5, 0.0]).as_matrix()
+    file = tmp_path / "keyframes.tum"
+    corrected = correction @ pose(1.0)
+    numbers = [0.1, *corrected[:3, 3], *Rotation.from_matrix(corrected[:3, :3]).as_quat()]
+    file.write_text(" ".join(f"{x:.9f}" for x in numbers) + "\n")
+    moved = _moved_with_keyframes(file, [(0.0, pose(0.0)), (0.1, pose(1.0)), (0.2, pose(2.0))])
+    assert [t for t, _ in moved] == [0.1, 0.2]  # no keyframe before the first frame
+    np.testing.assert_allclose(moved[0][1], corrected, atol=1e-8)
+    np.testing.assert_allclose(moved[1][1], correction @ pose(2.0), atol=1e-8)
 
 
 @pytest.mark.parametrize(

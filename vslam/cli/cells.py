@@ -194,8 +194,6 @@ def open_cells(
     from vslam.lab.bench.execute import RunOptions, scratch_folder
     from vslam.machine import available_cores
 
-    if given.sensor == "mono" and systems.others:
-        raise InputError("--sensor mono: other systems need both cameras; test vslam alone.")
     out, console = out.absolute(), Console(shown=shown)
     kind = kind_of_source(given)
     given = _absolute(given)

@@ -1,18 +1,24 @@
 """Runs other SLAM systems on perturbed images.
 
 The command of a system is a template with the placeholders ``{folder}`` and ``{out}``. The folder
-at ``{folder}`` is in KITTI's format. It contains ``image_0``, ``image_1``, ``calib.txt`` and
-``times.txt`` of the perturbed frames, without dropped frames and frames with an unreadable image.
-The command must write these files into the folder at ``{out}``:
+at ``{folder}`` is in KITTI's format. It contains ``image_0``, ``calib.txt`` and ``times.txt`` of
+the perturbed frames, without dropped frames and frames with an unreadable image. For a stereo
+camera, it also contains the right images in ``image_1``. For an RGB-D camera, it contains depth
+images in ``depth``. They have 16 bits and give the depth in millimetres, with 0 where it is unknown
+or above 65.5 m. The command must write these files into the folder at ``{out}``:
 
 - ``trajectory.txt`` contains the estimated poses. It has either one pose per frame in KITTI's
   format, or poses with times in TUM's format.
 - ``causal.txt`` (optional) contains the poses as they were first estimated, in the same format.
 - ``states.txt`` (optional) contains ``OK`` or ``LOST`` for each frame.
+- ``costs.json`` (optional) contains the seconds that the frame loop took, for example
+  ``{"wall_s": 12.5, "cpu_s": 20.1}``. Without it, the wall time is that of the whole command, and
+  the CPU time is 0.
 """
 
 from __future__ import annotations
 
+import json
 import shlex
 import subprocess
 import tempfile
@@ -91,7 +97,8 @@ def run_external(
         template: command of the system, with ``{folder}`` and ``{out}``.
 
     Raises:
-        InputError: the system exits with an error, or writes no trajectory.
+        InputError: the system exits with an error, writes no trajectory, or writes a malformed
+            file.
     """
     with tempfile.TemporaryDirectory(prefix="kitti.", dir=folder) as name:
         work = Path(name)
@@ -113,7 +120,7 @@ def run_external(
 def export_kitti(
     sequence: Source, perturbation: Perturbation, folder: Path
 ) -> tuple[NDArray[np.int64], dict[int, str]]:
-    """Write the perturbed frames of a sequence in KITTI's format.
+    """Write the perturbed frames of a sequence in KITTI's format, with the depth if there is any.
 
     Dropped frames and frames with an unreadable image are left out.
 
@@ -126,7 +133,8 @@ def export_kitti(
     times: list[float] = []
     kept: list[int] = []
     unreadable: dict[int, str] = {}
-    for name in ("image_0", "image_1"):
+    second = {"stereo": "image_1", "rgbd": "depth"}.get(sequence.camera.sensor)
+    for name in filter(None, ("image_0", second)):
         (folder / name).mkdir(parents=True)
     frames = perturbed(sequence.frames(), perturbation.bound_to(sequence))
     for index, frame in enumerate(frames):
@@ -137,16 +145,22 @@ def export_kitti(
         except UnreadableImageError as error:
             unreadable[index] = str(error)
             continue
-        for side, image in enumerate(images):
-            if image is not None and image.dtype == np.uint8:
-                path = folder / f"image_{side}" / f"{len(kept):06d}.png"
-                if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+        for place, image in zip(("image_0", second), images, strict=True):
+            if place and image is not None:
+                path = folder / place / f"{len(kept):06d}.png"
+                pixels = image if image.dtype == np.uint8 else _millimetres(image)
+                if not cv2.imwrite(str(path), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
                     raise ResultsError(f"{path}: cannot be written; is the disk full?")
         kept.append(index)
         times.append(frame.timestamp - float(sequence.timestamps[0]))
     (folder / "times.txt").write_text("".join(f"{t:.9e}\n" for t in times))
     (folder / "calib.txt").write_text(calibration_text(sequence.camera))
     return np.array(kept, np.int64), unreadable
+
+
+def _millimetres(depth: NDArray[np.generic]) -> NDArray[np.uint16]:
+    rounded = np.rint(1000.0 * np.nan_to_num(depth, posinf=0.0))
+    return np.where((rounded > 0) & (rounded < 2**16), rounded, 0).astype(np.uint16)
 
 
 def _call(template: str, sequence: Path, out: Path) -> None:
@@ -201,6 +215,7 @@ def _outcome(
     dropped[[*kept, *unreadable]] = False
     trajectory = final.bridged(times)
     given = np.where(causal.known[:, None, None], causal.T_wc, _last_known(causal))
+    wall, cpu = _costs(out / "costs.json", settings.detector) or (wall, 0.0)
     tracks = [
         TrackResult(
             k, float(times[k]), given[k],
@@ -218,13 +233,26 @@ def _outcome(
         tracks=tracks,
         skipped=[f"frame {index}: {message}" for index, message in unreadable.items()],
         wall_s=wall,
-        cpu_s=0.0,
+        cpu_s=cpu,
         startup_s=0.0,
         peak_memory_mb=0.0,
         n_keyframes=0,
         n_landmarks=0,
         n_submaps=0,
     )
+
+
+def _costs(path: Path, system: str) -> tuple[float, float] | None:
+    """Read the wall and CPU seconds of the frame loop. Return None if there is no such file."""
+    try:
+        costs = json.loads(path.read_bytes())
+        return float(costs["wall_s"]), float(costs["cpu_s"])
+    except FileNotFoundError:
+        return None
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f'{system}: {path.name} is malformed; write {{"wall_s": 12.5, "cpu_s": 20.1}}.'
+        ) from error
 
 
 def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) -> Poses:

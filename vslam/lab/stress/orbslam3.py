@@ -1,8 +1,10 @@
 """Run ORB-SLAM3 (``pip install pyorbslam3``) on a folder in KITTI's format.
 
-usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--frames N]
+usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--frames N] [--sensor stereo|mono|rgbd]
 
-The script prints the costs of its frame loop as a JSON object. It imports nothing from vslam,
+The folder contains the left images in ``image_0``. It may also contain the right images in
+``image_1``, or 16-bit depth images in millimetres in ``depth``. The script prints the costs of its
+frame loop as a JSON object, and writes them into ``OUT/costs.json``. It imports nothing from vslam,
 because pyorbslam3 may be installed in another Python environment. The process ends when its
 standard input is closed.
 """
@@ -32,14 +34,15 @@ Camera.p1: 0.0
 Camera.p2: 0.0
 Camera.width: {width}
 Camera.height: {height}
-Camera.fps: 10
+Camera.fps: {fps}
 Camera.bf: {bf}
 Camera.RGB: 1
 ThDepth: 40.0
-ORBextractor.nFeatures: 2000
+DepthMapFactor: 1.0
+ORBextractor.nFeatures: {features}
 ORBextractor.scaleFactor: 1.2
 ORBextractor.nLevels: 8
-ORBextractor.iniThFAST: 12
+ORBextractor.iniThFAST: {contrast}
 ORBextractor.minThFAST: 7
 Viewer.KeyFrameSize: 0.6
 Viewer.KeyFrameLineWidth: 2.0
@@ -54,57 +57,115 @@ Viewer.ViewpointF: 2000.0
 """
 
 
-def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
-    """Track stereo frames. Write ``trajectory.txt``, ``causal.txt`` and ``states.txt``.
+# Number of features and first threshold of FAST, from the settings of ORB-SLAM3 for KITTI and for
+# TUM's RGB-D data.
+_FEATURES = {"stereo": (2000, 12), "mono": (2000, 12), "rgbd": (1000, 20)}
+_SECOND = {"stereo": "image_1", "rgbd": "depth"}  # folder of the second image of a frame
+
+
+def main(vocabulary: str, folder: Path, out: Path, frames: int | None, sensor: str | None) -> None:
+    """Track the frames of a folder. Write the files that ``vslam.lab.stress.external`` reads.
 
     Args:
         vocabulary: vocabulary file of ORB-SLAM3.
         folder: folder in KITTI's format.
         out: output folder.
         frames: number of frames, counted from the first frame; None for all frames.
+        sensor: ``stereo``, ``mono`` or ``rgbd``. If it is None, the folders of the images tell it.
     """
     import pyorbslam3
 
     out.mkdir(exist_ok=True)
-    left, right = (sorted((folder / f"image_{side}").iterdir())[:frames] for side in (0, 1))
+    sensor = sensor or next((s for s, name in _SECOND.items() if (folder / name).is_dir()), "mono")
+    names = ["image_0"] if sensor == "mono" else ["image_0", _SECOND[sensor]]
+    left, *second = (sorted((folder / name).iterdir())[:frames] for name in names)
     times = np.loadtxt(folder / "times.txt", ndmin=1)[:frames].tolist()
-    rows = (folder / "calib.txt").read_text().splitlines()
-    P0, P1 = (np.array(row.split()[1:], float).reshape(3, 4) for row in rows[:2])
-    height, width = np.asarray(cv2.imread(str(left[0]), 0)).shape
     settings = out / "settings.yaml"
-    settings.write_text(
-        _SETTINGS.format(
-            fx=P0[0, 0], fy=P0[1, 1], cx=P0[0, 2], cy=P0[1, 2], width=width, height=height,
-            bf=-P1[0, 3],
-        )
-    )  # fmt: skip
-    slam = pyorbslam3.Slam(vocabulary, str(settings), pyorbslam3.Sensor.STEREO, use_viewer=False)
+    settings.write_text(_settings(folder, left[0], times, sensor))
+    kind = {
+        "stereo": pyorbslam3.Sensor.STEREO,
+        "mono": pyorbslam3.Sensor.MONOCULAR,
+        "rgbd": pyorbslam3.Sensor.RGBD,
+    }[sensor]
+    slam = pyorbslam3.Slam(vocabulary, str(settings), kind, use_viewer=False)
+    track = {"stereo": slam.track_stereo, "mono": slam.track_monocular, "rgbd": slam.track_rgbd}
     causal, states, track_ms = [], [], []
     wall, cpu = time.perf_counter(), time.process_time()
-    for *paths, t in zip(left, right, times, strict=True):
-        images = [cv2.imread(str(path), 0) for path in paths]
+    for *paths, t in zip(left, *second, times, strict=True):
+        images = [_read(path) for path in paths]
         began = time.perf_counter()
-        found = slam.track_stereo(*images, t)
+        found = track[sensor](*images, t)
         track_ms.append(1e3 * (time.perf_counter() - began))
         states.append("OK" if found.state == pyorbslam3.TrackingState.OK else "LOST")
         pose = found.pose_wc if found.pose_valid else None
         if pose is not None:
             causal.append((t, np.asarray(pose, float)))
+    wall_s, cpu_s = time.perf_counter() - wall, time.process_time() - cpu
     costs = {
         "frames": len(left),
-        "fps": len(left) / (time.perf_counter() - wall),
-        "cpu_ms_per_frame": 1e3 * (time.process_time() - cpu) / len(left),
+        "fps": len(left) / wall_s,
+        "cpu_ms_per_frame": 1e3 * cpu_s / len(left),
         "track_ms_median": float(np.median(track_ms)),
         "track_ms_p95": float(np.percentile(track_ms, 95)),
         "lost": states.count("LOST"),
     }
     slam.shutdown()
     tum = out / "trajectory.txt"
-    slam.save_trajectory_tum(str(tum))
+    if sensor == "mono":  # ORB-SLAM3 saves only the keyframes of a monocular run
+        slam.save_keyframe_trajectory_tum(str(tum))
+        tum.write_text("".join(_tum(t, T) for t, T in _moved_with_keyframes(tum, causal)))
+    else:
+        slam.save_trajectory_tum(str(tum))
     _keep_first_of_each_time(tum)
     (out / "causal.txt").write_text("".join(_tum(t, T) for t, T in causal))
     (out / "states.txt").write_text("\n".join(states))
+    (out / "costs.json").write_text(json.dumps({"wall_s": wall_s, "cpu_s": cpu_s}))
     sys.stdout.write(f"{json.dumps(costs)}\n")
+
+
+def _settings(folder: Path, image: Path, times: list[float], sensor: str) -> str:
+    rows = (folder / "calib.txt").read_text().splitlines()
+    P0, P1 = (np.array(row.split()[1:], float).reshape(3, 4) for row in rows[:2])
+    height, width = _read(image).shape
+    features, contrast = _FEATURES[sensor]
+    return _SETTINGS.format(
+        fx=P0[0, 0], fy=P0[1, 1], cx=P0[0, 2], cy=P0[1, 2], width=width, height=height,
+        bf=-P1[0, 3], fps=max(1, round(1 / np.median(np.diff(times)))) if times[1:] else 10,
+        features=features, contrast=contrast,
+    )  # fmt: skip
+
+
+def _read(path: Path) -> np.ndarray:
+    """Read a grey image, or a depth image as float32 in metres."""
+    image = np.asarray(cv2.imread(str(path), cv2.IMREAD_ANYDEPTH))
+    return image.astype(np.float32) / 1000 if image.dtype == np.uint16 else image
+
+
+def _moved_with_keyframes(
+    keyframes: Path, causal: list[tuple[float, np.ndarray]]
+) -> list[tuple[float, np.ndarray]]:
+    """Return the poses of all frames, moved with the keyframes that were corrected later.
+
+    A frame keeps its pose relative to the last keyframe before it, as ORB-SLAM3 does it for stereo.
+    """
+    final = {round(row[0], 3): _pose(row) for row in np.loadtxt(keyframes, ndmin=2)}
+    found, correction = [], None
+    for t, T_wc in causal:
+        if round(t, 3) in final:
+            correction = final[round(t, 3)] @ np.linalg.inv(T_wc)
+        if correction is not None:
+            found.append((t, correction @ T_wc))
+    return found
+
+
+def _pose(row: np.ndarray) -> np.ndarray:
+    """Return the pose of a row in TUM's format."""
+    xyz, w = row[4:7], row[7]
+    T_wc = np.eye(4)
+    angle = 2 * np.arctan2(np.linalg.norm(xyz), w)
+    axis = xyz / (np.linalg.norm(xyz) or 1)
+    T_wc[:3, :3], T_wc[:3, 3] = cv2.Rodrigues(angle * axis)[0], row[1:4]
+    return T_wc
 
 
 def _keep_first_of_each_time(path: Path) -> None:
@@ -136,4 +197,5 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--frames", type=int)
+    parser.add_argument("--sensor", choices=_FEATURES)
     main(**vars(parser.parse_args()))

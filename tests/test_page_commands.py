@@ -212,7 +212,11 @@ RULES = {
     "docs/research/results.md": Rules(not_run=(("ORBSLAM3=", ORBSLAM), ("vslam bench", HOURS))),
     "docs/howto/rgbd.md": Rules(
         (("demo --rgbd", f"demo --rgbd --max-frames {N}"),),
-        (("vslam synth block", AGAIN), ("vslam run --data block", AGAIN)),
+        (
+            ("vslam synth block", AGAIN),
+            ("vslam run --data block", AGAIN),
+            ("vslam bench --data rgbd_dataset_freiburg1_desk", ORBSLAM),
+        ),
     ),
     "docs/howto/sources.md": Rules(
         not_run=(

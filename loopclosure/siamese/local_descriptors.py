@@ -18,7 +18,7 @@ from vslam.loopclosure.siamese.weights import SHIPPED
 from vslam.loops import PerKeyframe
 
 SHIPPED_LOCAL = SHIPPED / "local.onnx"
-WIDTH = 640  # width of the network's input, pixels (compared in docs/research/local_descriptors.md)
+WIDTH = 640  # width of the network's input, pixels
 GLANCE_WIDTH = 320  # input width for a quick comparison ("glance"), pixels
 _QUALITY = 90  # JPEG quality of the keyframe images in memory
 _JPEG = b"\xff\xd8"  # the first bytes of a JPEG file

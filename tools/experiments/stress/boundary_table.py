@@ -17,7 +17,10 @@ NAMES = {"bow": "vslam", "orbslam3": "ORB-SLAM3"}
 
 
 def table(paths: list[Path], ours: str, theirs: str) -> str:
-    """Return a Markdown table of the boundaries of the two systems, by perturbation."""
+    """Return a Markdown table of the boundaries of the two systems.
+
+    It contains the perturbations under which both systems were run.
+    """
     rows = {}
     for path in paths:
         with path.open(newline="") as file:
@@ -28,16 +31,14 @@ def table(paths: list[Path], ours: str, theirs: str) -> str:
     columns = [f"{name} {what}" for name in names for what in ("holds to", "fails at")]
     lines = [f"| law | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
     for law, kind in LAWS.items():
-        found = [rows.get((law, system)) for system in (ours, theirs)]
-        if any(found):
+        found = [rows[law, system] for system in (ours, theirs) if (law, system) in rows]
+        if len(found) == 2:
             name = f"`{law}`" + (f", {kind.unit}" if kind.unit != "x" else "")
             lines.append(f"| {name} | {' | '.join(map(_cells, found))} |")
     return "\n".join(lines)
 
 
-def _cells(row: dict[str, str] | None) -> str:
-    if row is None:
-        return "- | -"
+def _cells(row: dict[str, str]) -> str:
     held = f"{float(row['holds_to']):g}" if row["holds_to"] else "nothing"
     failed = f"{float(row['fails_at']):g}: {row['reason']}" if row["fails_at"] else "never"
     return f"{held} | {failed}"

@@ -207,7 +207,11 @@ RULES = {
         not_run=(("vslam loops bench", "it takes hours; test_online.py runs it"),)
     ),
     "docs/research/performance.md": Rules(
-        not_run=(("python tools/bench_speed.py", ORBSLAM), ("for drive in block+moving", AGAIN))
+        not_run=(
+            ("python tools/bench_speed.py", ORBSLAM),
+            ("vslam bench", ORBSLAM),
+            ("for drive in block+moving", AGAIN),
+        )
     ),
     "docs/research/results.md": Rules(not_run=(("ORBSLAM3=", ORBSLAM), ("vslam bench", HOURS))),
     "docs/howto/rgbd.md": Rules(

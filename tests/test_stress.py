@@ -503,23 +503,29 @@ def test_the_costs_of_another_system_are_those_it_writes(tmp_path):
         run_script(root, DRIVES + '(out / "costs.json").write_text("[1]")\n')
 
 
-def test_frames_move_with_the_last_corrected_keyframe(tmp_path):
+def test_frames_move_with_the_corrected_keyframe_before_them(tmp_path):
     def pose(x: float) -> np.ndarray:
         T = np.eye(4)
         T[:3, :3] = Rotation.from_rotvec([0.1, -2.0, 0.3]).as_matrix()
         T[0, 3] = x
         return T
 
-    correction = np.eye(4)
-    correction[:3, :3] = Rotation.from_rotvec([0.0, 0.5, 0.0]).as_matrix()
+    def corrected(x: float) -> np.ndarray:  # turned by 0.5 rad and twice as large
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_rotvec([0.0, 0.5, 0.0]).as_matrix()
+        return T @ pose(2.0 * x)
+
+    causal = [(0.1 * k, pose(float(k))) for k in range(6)]
     file = tmp_path / "keyframes.tum"
-    corrected = correction @ pose(1.0)
-    numbers = [0.1, *corrected[:3, 3], *Rotation.from_matrix(corrected[:3, :3]).as_quat()]
-    file.write_text(" ".join(f"{x:.9f}" for x in numbers) + "\n")
-    moved = _moved_with_keyframes(file, [(0.0, pose(0.0)), (0.1, pose(1.0)), (0.2, pose(2.0))])
-    assert [t for t, _ in moved] == [0.1, 0.2]  # no keyframe before the first frame
-    np.testing.assert_allclose(moved[0][1], corrected, atol=1e-8)
-    np.testing.assert_allclose(moved[1][1], correction @ pose(2.0), atol=1e-8)
+    rows = []
+    for k in (1, 3):
+        T = corrected(k)
+        rows.append([0.1 * k, *T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()])
+    np.savetxt(file, rows, fmt="%.9f")
+    moved = _moved_with_keyframes(file, causal)
+    assert [t for t, _ in moved] == [t for t, _ in causal[1:]]  # no keyframe before the first frame
+    for (_, T), k in zip(moved, range(1, 6), strict=True):
+        np.testing.assert_allclose(T, corrected(k), atol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,13 @@
 usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--frames N] [--sensor stereo|mono|rgbd]
 
 The folder contains the left images in ``image_0``. It may also contain the right images in
-``image_1``, or 16-bit depth images in millimetres in ``depth``. The script prints the costs of its
-frame loop as a JSON object, and writes them into ``OUT/costs.json``. It imports nothing from vslam,
-because pyorbslam3 may be installed in another Python environment. The process ends when its
-standard input is closed.
+``image_1``, or 16-bit depth images in millimetres in ``depth``. Images of a single camera are
+tracked no faster than the camera took them.
+
+The script prints the costs of its frame loop as a JSON object, and writes them into
+``OUT/costs.json``. Waiting is not counted. The script imports nothing from vslam, because
+pyorbslam3 may be installed in another Python environment. The process ends when its standard input
+is closed.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ import os
 import sys
 import threading
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -89,10 +93,16 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None, sensor: s
     }[sensor]
     slam = pyorbslam3.Slam(vocabulary, str(settings), kind, use_viewer=False)
     track = {"stereo": slam.track_stereo, "mono": slam.track_monocular, "rgbd": slam.track_rgbd}
-    causal, states, track_ms = [], [], []
+    causal, states, track_ms, waited_s = [], [], [], 0.0
     wall, cpu = time.perf_counter(), time.process_time()
     for *paths, t in zip(left, *second, times, strict=True):
         images = [_read(path) for path in paths]
+        if sensor == "mono":
+            # Tracking does not wait for mapping. If images arrive faster than from the camera,
+            # mapping falls behind, and a monocular run loses track.
+            early_s = max(0.0, t - times[0] - (time.perf_counter() - wall))
+            time.sleep(early_s)
+            waited_s += early_s
         began = time.perf_counter()
         found = track[sensor](*images, t)
         track_ms.append(1e3 * (time.perf_counter() - began))
@@ -100,7 +110,7 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None, sensor: s
         pose = found.pose_wc if found.pose_valid else None
         if pose is not None:
             causal.append((t, np.asarray(pose, float)))
-    wall_s, cpu_s = time.perf_counter() - wall, time.process_time() - cpu
+    wall_s, cpu_s = time.perf_counter() - wall - waited_s, time.process_time() - cpu
     costs = {
         "frames": len(left),
         "fps": len(left) / wall_s,
@@ -146,15 +156,23 @@ def _moved_with_keyframes(
 ) -> list[tuple[float, np.ndarray]]:
     """Return the poses of all frames, moved with the keyframes that were corrected later.
 
-    A frame keeps its pose relative to the last keyframe before it, as ORB-SLAM3 does it for stereo.
+    A frame keeps its pose relative to the last keyframe before it. Distances are scaled like the
+    distance from this keyframe to the next one, because corrections change the scale.
     """
     final = {round(row[0], 3): _pose(row) for row in np.loadtxt(keyframes, ndmin=2)}
-    found, correction = [], None
+    pairs = [(T_wc, final[round(t, 3)]) for t, T_wc in causal if round(t, 3) in final]
+    moves = [np.subtract(b, a)[:, :3, 3] for a, b in pairwise(pairs)]
+    lengths = [(np.linalg.norm(before), np.linalg.norm(after)) for before, after in moves]
+    scales = [after / before if before else 1.0 for before, after in lengths]
+    scales += scales[-1:] or [1.0]  # no keyframe follows the last one
+    found: list[tuple[float, np.ndarray]] = []
+    k = -1
     for t, T_wc in causal:
-        if round(t, 3) in final:
-            correction = final[round(t, 3)] @ np.linalg.inv(T_wc)
-        if correction is not None:
-            found.append((t, correction @ T_wc))
+        k += round(t, 3) in final
+        if k >= 0:
+            T_kf = np.linalg.inv(pairs[k][0]) @ T_wc
+            T_kf[:3, 3] *= scales[k]
+            found.append((t, pairs[k][1] @ T_kf))
     return found
 
 

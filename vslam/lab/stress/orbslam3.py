@@ -1,6 +1,6 @@
 """Run ORB-SLAM3 (``pip install pyorbslam3``) on a folder in KITTI's format.
 
-usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--frames N] [--sensor stereo|mono|rgbd]
+usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--frames N]
 
 The folder contains the left images in ``image_0``. It may also contain the right images in
 ``image_1``, or 16-bit depth images in millimetres in ``depth``. Images of a single camera are
@@ -67,7 +67,7 @@ _FEATURES = {"stereo": (2000, 12), "mono": (2000, 12), "rgbd": (1000, 20)}
 _SECOND = {"stereo": "image_1", "rgbd": "depth"}  # folder of the second image of a frame
 
 
-def main(vocabulary: str, folder: Path, out: Path, frames: int | None, sensor: str | None) -> None:
+def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
     """Track the frames of a folder. Write the files that ``vslam.lab.stress.external`` reads.
 
     Args:
@@ -75,12 +75,11 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None, sensor: s
         folder: folder in KITTI's format.
         out: output folder.
         frames: number of frames, counted from the first frame; None for all frames.
-        sensor: ``stereo``, ``mono`` or ``rgbd``. If it is None, the folders of the images tell it.
     """
     import pyorbslam3
 
     out.mkdir(exist_ok=True)
-    sensor = sensor or next((s for s, name in _SECOND.items() if (folder / name).is_dir()), "mono")
+    sensor = next((s for s, name in _SECOND.items() if (folder / name).is_dir()), "mono")
     names = ["image_0"] if sensor == "mono" else ["image_0", _SECOND[sensor]]
     left, *second = (sorted((folder / name).iterdir())[:frames] for name in names)
     times = np.loadtxt(folder / "times.txt", ndmin=1)[:frames].tolist()
@@ -215,5 +214,4 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--frames", type=int)
-    parser.add_argument("--sensor", choices=_FEATURES)
     main(**vars(parser.parse_args()))

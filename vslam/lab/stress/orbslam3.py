@@ -91,7 +91,11 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
         "rgbd": pyorbslam3.Sensor.RGBD,
     }[sensor]
     slam = pyorbslam3.Slam(vocabulary, str(settings), kind, use_viewer=False)
-    track = {"stereo": slam.track_stereo, "mono": slam.track_monocular, "rgbd": slam.track_rgbd}
+    track = {
+        "stereo": slam.track_stereo,
+        "mono": slam.track_monocular,
+        "rgbd": slam.track_rgbd,
+    }[sensor]
     causal, states, track_ms, waited_s = [], [], [], 0.0
     wall, cpu = time.perf_counter(), time.process_time()
     for *paths, t in zip(left, *second, times, strict=True):
@@ -103,7 +107,7 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
             time.sleep(early_s)
             waited_s += early_s
         began = time.perf_counter()
-        found = track[sensor](*images, t)
+        found = track(*images, t)
         track_ms.append(1e3 * (time.perf_counter() - began))
         states.append("OK" if found.state == pyorbslam3.TrackingState.OK else "LOST")
         pose = found.pose_wc if found.pose_valid else None
@@ -117,6 +121,8 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
         "track_ms_median": float(np.median(track_ms)),
         "track_ms_p95": float(np.percentile(track_ms, 95)),
         "lost": states.count("LOST"),
+        "wall_s": wall_s,
+        "cpu_s": cpu_s,
     }
     slam.shutdown()
     tum = out / "trajectory.txt"
@@ -128,8 +134,9 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
     _keep_first_of_each_time(tum)
     (out / "causal.txt").write_text("".join(_tum(t, T) for t, T in causal))
     (out / "states.txt").write_text("\n".join(states))
-    (out / "costs.json").write_text(json.dumps({"wall_s": wall_s, "cpu_s": cpu_s}))
-    sys.stdout.write(f"{json.dumps(costs)}\n")
+    text = f"{json.dumps(costs)}\n"
+    (out / "costs.json").write_text(text)
+    sys.stdout.write(text)
 
 
 def _settings(folder: Path, image: Path, times: list[float], sensor: str) -> str:

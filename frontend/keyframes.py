@@ -232,6 +232,8 @@ class KeyframePolicy:
             soon = range(self._config.patch_lead_frames + 1)
             planned = (index + k for k in soon if self.wants_keyframe(evidence.ahead(k)))
             self._state = replace(self._state, due=next(planned, -1))
+        elif evidence.n_inliers < self._config.min_tracked_close and self.wants_keyframe(evidence):
+            self._state = replace(self._state, due=index)  # the plan came too late
         if not 0 <= self.due <= index:
             return False
         self._state = replace(self._state, due=-1)

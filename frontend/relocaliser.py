@@ -23,14 +23,17 @@ from vslam.frontend.tracking import (
     sampled_pose,
     track_local_map,
 )
-from vslam.loops import Localisation, LoopCandidate
+from vslam.loops import LastSeen, Localisation, LoopCandidate
 from vslam.map import Map
 from vslam.map_view import LocalMap, local_map
 
 Locate = Callable[[Image | None, Features, Map], list[LoopCandidate]]
-# Finds the pose of a frame near one of the candidates by other means than ORB descriptors. Returns
-# None if it finds no pose.
-Recognise = Callable[[Map, Image | None, Features, list[LoopCandidate]], Localisation | None]
+# Finds the pose of a frame near one of the candidates by other means than ORB descriptors.
+# Candidates that the camera cannot have reached since it was last tracked are left out. The result
+# is None if it finds no pose.
+Recognise = Callable[
+    [Map, Image | None, Features, list[LoopCandidate], LastSeen | None], Localisation | None
+]
 
 
 class MapAccess(Protocol):
@@ -63,7 +66,9 @@ class Relocaliser:
         self._locate = locate
         self._recognise = recognise
 
-    def relocalise_if_needed(self, frame: Frame, found: Found, owner: MapAccess) -> Found:
+    def relocalise_if_needed(
+        self, frame: Frame, found: Found, owner: MapAccess, last: LastSeen | None = None
+    ) -> Found:
         """Relocalise a frame if it is lost or doubtful. A frame is doubtful if it has so few
         inliers that its matches may be wrong.
 
@@ -74,23 +79,24 @@ class Relocaliser:
 
         Args:
             found: the result of tracking the frame.
+            last: where and when the camera was last tracked; None if it may be anywhere.
 
         Returns:
             The result of the relocalisation, or ``found`` if the frame was not relocalised.
         """
         if found.is_lost:
-            return self._find(frame, owner.merge()) if owner.is_merged else found
+            return self._find(frame, owner.merge(), last) if owner.is_merged else found
         if not found.is_doubtful:
             return found
         map_ = owner.merge()  # worth the wait: a doubtful frame soon becomes a keyframe
         before = frame.snapshot()
-        relocalised = self._find(frame, map_)
+        relocalised = self._find(frame, map_, last)
         if relocalised.n_inliers > self._context.config.relocalization.better * found.n_inliers:
             return relocalised
         frame.restore(before)
         return found
 
-    def _find(self, frame: Frame, map_: Map) -> Found:
+    def _find(self, frame: Frame, map_: Map, last: LastSeen | None) -> Found:
         config = self._context.config.relocalization
         candidates = self._locate(frame.image, frame.features, map_)
         for candidate in candidates[: config.max_candidates]:
@@ -99,7 +105,7 @@ class Relocaliser:
             n_inliers = relocalise(frame, place, around, self._context, seed=candidate.match)
             if n_inliers:
                 return self._result(n_inliers, candidate.match)
-        localised = self._recognise(map_, frame.image, frame.features, candidates)
+        localised = self._recognise(map_, frame.image, frame.features, candidates, last)
         if localised is None:
             return Found(TrackingState.LOST)
         frame.set_camera_pose(localised.T_cw)

@@ -8,7 +8,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import Extracted, TrackingState, TrackResult
+from vslam.features import Extracted, TrackingState, TrackResult, nearest_features
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
 from vslam.frontend.orb import level_shapes
@@ -22,6 +22,7 @@ from vslam.frontend.tracking import (
     track_sudden_motion,
 )
 from vslam.geometry import Matrix, inverse, orthonormalised, se3_exp, se3_log, transform
+from vslam.loops import LastSeen
 from vslam.map_view import MapView
 from vslam.odometry import Odometry
 from vslam.states import TrackerState
@@ -116,6 +117,13 @@ class Tracker:
         unknown."""
         return self._resumed_twist if self.last is None else self.last.twist
 
+    def last_seen(self, timestamp: float, view: MapView) -> LastSeen | None:
+        """Return where the camera was last tracked, and how long before a time (seconds) that was.
+        None if it has not been tracked yet."""
+        if self.last is None:
+            return None
+        return LastSeen(view.reference, timestamp - self.last.timestamp)
+
     def predict(self, timestamp: float, frames: FramePoses, view: MapView) -> Matrix:
         """Predict the ``(4, 4)`` pose of the camera (world to camera) at a given time.
 
@@ -174,9 +182,38 @@ class Tracker:
         frame.landmark, frame.xyz = track.ids, track.xyz
         return Found(TrackingState.OK, track.n_matches, n_inliers, track.visible)
 
-    def match_features(self, frame: Frame, view: MapView) -> bool:
-        """Match the landmarks of the local map to the features of a frame whose pose is known.
-        Returns whether the frame is still tracked."""
+    def match_features(self, frame: Frame, by_patches: Frame, view: MapView) -> bool:
+        """Match the landmarks of the local map to the features of a frame that was tracked by
+        patches.
+
+        If too few descriptors match, each landmark whose patch was found is first matched to the
+        nearest feature. This happens, for example, when the fog suddenly becomes so dense that the
+        contrast of the image is raised before features are extracted.
+
+        Args:
+            frame: the frame with its features.
+            by_patches: the same frame, as it was tracked by patches.
+
+        Returns:
+            Whether enough features were matched.
+        """
+        if self._match_local_map(frame, view):
+            return True
+        frame.T_cw = by_patches.T_cw
+        frame.drop_matches()
+        found, features = np.flatnonzero(by_patches.landmark >= 0), frame.features
+        feature, index = nearest_features(
+            by_patches.features.xy[found],
+            features.xy,
+            features.octave,
+            self._context.scales,
+            self._config.tracking.patch_feature_reach,
+        )
+        found = found[index]
+        frame.match(feature, by_patches.landmark[found], by_patches.xyz[found])
+        return self._match_local_map(frame, view)
+
+    def _match_local_map(self, frame: Frame, view: MapView) -> bool:
         n_matches, n_inliers, _ = track_local_map(
             frame, view.local_landmarks, self._context, patches=view.patches
         )

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, Image
 from vslam.config import Config, LearnedMatchingConfig, VerificationConfig
-from vslam.features import Features
-from vslam.geometry import Matrix, inverse, orthonormalised, transform
+from vslam.features import Features, nearest_features
+from vslam.geometry import inverse, orthonormalised, transform
 from vslam.loopclosure.learned_localisation import PoseEstimate, localise, project, view_of
 from vslam.loopclosure.local_matching import DescriptorMaps, likeness, locate_near
+from vslam.loopclosure.reach import within_reach
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verification import (
     guided_match,
@@ -26,7 +27,7 @@ from vslam.loopclosure.verification import (
     relative_scale,
     spread_reason,
 )
-from vslam.loops import Localisation, LoopCandidate, LoopEdge
+from vslam.loops import LastSeen, Localisation, LoopCandidate, LoopEdge
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
 from vslam.states import VerifierState
@@ -208,7 +209,7 @@ def recognise(
         return None
     index = np.flatnonzero(estimate.seen)
     feature, near = nearest_features(
-        estimate.uv[index], features.xy, features.octave, map_.scales, config.learned
+        estimate.uv[index], features.xy, features.octave, map_.scales, config.learned.fuse_pixels
     )
     if len(feature) < config.tracking.min_inliers:
         return None
@@ -229,7 +230,9 @@ def observed_features(
     """
     a, rows = map_.arrays, map_.rows(query)
     landmarks, uv = estimate.landmarks[estimate.seen], estimate.uv[estimate.seen]
-    feature, index = nearest_features(uv, a.xy[rows], a.octave[rows], map_.scales, config)
+    feature, index = nearest_features(
+        uv, a.xy[rows], a.octave[rows], map_.scales, config.fuse_pixels
+    )
     own = a.landmark[rows][feature]
     depth = transform(estimate.T_cw, a.xyz[landmarks[index]])[:, 2]
     ratio = np.where(own >= 0, transform(a.T_cw[query], a.xyz[own])[:, 2] / depth, np.nan)
@@ -248,39 +251,6 @@ def joined(
     neither its feature nor its landmark is in the first list."""
     new = ~(np.isin(second[0], first[0]) | np.isin(second[1], first[1]))
     return np.r_[first[0], second[0][new]], np.r_[first[1], second[1][new]]
-
-
-def nearest_features(
-    uv: Matrix,
-    xy: NDArray[np.float32],
-    octave: NDArray[np.uint8],
-    scales: NDArray[np.float64],
-    config: LearnedMatchingConfig,
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Match image positions with the nearest features. The distance of a match is at most
-    ``config.fuse_pixels``, measured in pixels of the feature's octave.
-
-    Args:
-        uv: ``(N, 2)`` positions in the image, pixels.
-        xy, octave: ``(F, 2)`` positions in pixels and ``(F,)`` octaves of the features.
-
-    Returns:
-        ``(K,)`` indices of features, without duplicates, and ``(K,)`` indices of the matched
-        positions. The pair with the smallest distance comes first.
-    """
-    if not len(uv) or not len(xy):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    # Brute force takes 3 ms. SciPy's k-d tree is faster, but its import takes 27 MB and 0.2 s. If
-    # several features lie at the same pixel, the k-d tree returns an arbitrary one. ``argmin``
-    # returns the first one, which has the finest octave.
-    x, y = xy.T.astype(np.float64)
-    feature = np.array([np.argmin((x - u) ** 2 + (y - v) ** 2) for u, v in uv.tolist()])
-    distance = np.sqrt((x[feature] - uv[:, 0]) ** 2 + (y[feature] - uv[:, 1]) ** 2)
-    near = np.flatnonzero(distance <= config.fuse_pixels * scales[octave[feature]])
-    near = near[np.argsort(distance[near], kind="stable")]
-    _, first = np.unique(feature[near], return_index=True)
-    near = near[np.sort(first)]
-    return np.asarray(feature[near], np.int64), near
 
 
 def _rejection_reason(
@@ -360,11 +330,20 @@ class LearnedRelocalisation:
         self._config = config
 
     def __call__(
-        self, map_: Map, image: Image | None, features: Features, candidates: list[LoopCandidate]
+        self,
+        map_: Map,
+        image: Image | None,
+        features: Features,
+        candidates: list[LoopCandidate],
+        last: LastSeen | None,
     ) -> Localisation | None:
         images, config = self._images, self._config
         if images is None or image is None:
             return None
+        if last is not None and candidates:
+            # Unlike a loop, a relocalised pose is not confirmed by a second keyframe.
+            reachable = within_reach(map_, last, config.siamese)
+            candidates = [one for one in candidates if reachable[one.match]]
         candidates = with_similarities(
             candidates, lambda: images.glance_at(image), images, config.learned
         )

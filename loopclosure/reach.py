@@ -1,4 +1,5 @@
-"""Uses odometry to limit loop detection to the keyframes that the camera may be revisiting."""
+"""Uses odometry to limit loop detection and relocalisation to the keyframes at which the camera may
+be."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import SiameseConfig
+from vslam.loops import LastSeen
 from vslam.map import Map
 
 
@@ -32,22 +34,74 @@ def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.
         ``(n_keyframes,)`` float64, in the unit of the map. The value is at most 0 for keyframes
         within reach, and infinite for keyframes with a different viewing direction.
     """
-    n, a = map_.n_keyframes, map_.arrays
-    T = a.T_cw[:n]
-    position = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
+    beyond = _distances_beyond_reach(map_, keyframe, config)
+    direction = map_.arrays.T_cw[: map_.n_keyframes, 2, :3]  # in the world frame
+    beyond[direction @ direction[keyframe] < np.cos(np.radians(config.reach_angle))] = np.inf
+    beyond[_in_other_submap(map_, keyframe)] = 0.0
+    return beyond
+
+
+def within_reach(map_: Map, last: LastSeen, config: SiameseConfig) -> NDArray[np.bool_]:
+    """Return the keyframes at which a lost camera may be, as an ``(n_keyframes,)`` mask.
+
+    The distance between a keyframe and the place where the camera was last tracked is limited as in
+    :func:`beyond_reach`. The limit is larger by the distance that the camera may have travelled
+    while it was lost, now and before earlier sub-maps. Its speed is assumed to be at most
+    ``config.reach_speedup`` times the mean speed along the keyframes of the map.
+
+    The viewing direction is not limited. Keyframes of other drives are always within reach. This is
+    also true of keyframes of other sub-maps if their poses relative to the camera are unknown.
+    """
     living = map_.living_keyframes()
-    steps = np.linalg.norm(np.diff(position[living], axis=0), axis=1)
-    odometer = np.zeros(n)
-    odometer[living[1:]] = np.cumsum(steps)
+    drive = map_.sessions[living]
+    elapsed = np.where(np.diff(drive) == 0, np.diff(map_.timestamps[living]), 0.0)
+    steps = np.where(np.diff(drive) == 0, _steps(map_, living), 0.0)
+    if elapsed.sum() <= 0.0:
+        return np.ones(map_.n_keyframes, np.bool_)
+    restarts = map_.keyframes.restart[living[1:]] != 0
+    lost_s = np.zeros(map_.n_keyframes)  # time for which the camera was lost until each keyframe
+    lost_s[living[1:]] = np.where(restarts, elapsed, 0.0)
+    lost_s = np.cumsum(lost_s)
+    lost_s = np.abs(lost_s - lost_s[last.keyframe]) + last.elapsed_s
+    travelled = config.reach_speedup * steps.sum() / elapsed.sum() * lost_s
+    beyond = _distances_beyond_reach(map_, last.keyframe, config) - travelled
+    unknown = map_.sessions != map_.sessions[last.keyframe]
+    if map_.unpredicted_restarts or not _is_metric(map_, last.keyframe):
+        unknown |= _in_other_submap(map_, last.keyframe)
+    return (beyond <= 0.0) | unknown
+
+
+def _distances_beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.float64]:
+    living = map_.living_keyframes()
+    moved = np.zeros(map_.n_keyframes)
+    moved[living[1:]] = _steps(map_, living)
+    odometer = np.cumsum(moved)
     driven = np.abs(odometer[keyframe] - odometer)
+    position = _positions(map_)
     distance = np.linalg.norm(position - position[keyframe], axis=1)
-    if np.isfinite(a.u_right[map_.rows(keyframe)]).any():
+    if _is_metric(map_, keyframe):
         beyond = distance - config.reach - config.reach_share * driven
     else:
         beyond = distance - config.monocular_reach_share * driven
-    direction = T[:, 2, :3]  # viewing direction of each keyframe in the world frame
-    beyond[direction @ direction[keyframe] < np.cos(np.radians(config.reach_angle))] = np.inf
-    if map_.restarts:
-        submap = map_.submaps()
-        beyond[submap != submap[keyframe]] = 0.0
     return np.asarray(beyond, np.float64)
+
+
+def _is_metric(map_: Map, keyframe: int) -> bool:
+    return bool(np.isfinite(map_.arrays.u_right[map_.rows(keyframe)]).any())
+
+
+def _in_other_submap(map_: Map, keyframe: int) -> NDArray[np.bool_]:
+    if not map_.restarts:
+        return np.zeros(map_.n_keyframes, np.bool_)
+    submap = map_.submaps()
+    return np.asarray(submap != submap[keyframe], np.bool_)
+
+
+def _positions(map_: Map) -> NDArray[np.float64]:
+    T = map_.arrays.T_cw[: map_.n_keyframes]
+    return np.asarray(-np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3]), np.float64)
+
+
+def _steps(map_: Map, living: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the distances between consecutive keyframes."""
+    return np.asarray(np.linalg.norm(np.diff(_positions(map_)[living], axis=0), axis=1), np.float64)

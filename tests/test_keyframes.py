@@ -237,6 +237,16 @@ def test_a_keyframe_is_planned_for_the_frame_that_will_have_lost_too_many_close_
     assert one.is_due(16, replace(losing, tracked_close=390))  # there is no time to plan
 
 
+@pytest.mark.parametrize(("n_inliers", "at_once"), [(99, True), (100, False)])
+def test_a_planned_keyframe_is_made_at_once_if_few_landmarks_are_left(n_inliers, at_once):
+    one = policy()
+    losing = replace(CONTENT, untracked_close=None, close_ratio=0.8)
+    assert not one.is_due(10, replace(losing, tracked_close=150))
+    assert one.due == 12
+    few = replace(losing, n_inliers=n_inliers, tracked_close=min(n_inliers, 99))
+    assert one.is_due(11, few) is at_once
+
+
 def test_close_points_are_lost_from_the_first_frame_after_a_keyframe_on():
     one = policy()
     one.keyframe_made()

@@ -11,17 +11,17 @@ from vslam.config import Config
 from vslam.features import Features
 from vslam.geometry import inverse, se3_exp, transform
 from vslam.loopclosure.learned_verification import (
+    LearnedRelocalisation,
     LearnedTrials,
     is_image_redundant,
     joined,
-    nearest_features,
     recognise,
     verify_learned,
     with_similarities,
 )
 from vslam.loopclosure.local_matching import DescriptorMaps
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
-from vslam.loops import LoopCandidate
+from vslam.loops import LastSeen, LoopCandidate
 from vslam.map import Map
 from vslam.map_kernels import link_many
 
@@ -172,23 +172,22 @@ def test_a_lost_frame_is_recognised(network):
     assert len(found.feature) >= CONFIG.tracking.min_inliers
 
 
+def test_a_lost_frame_is_not_recognised_where_the_camera_cannot_be(network):
+    world = World(network, T_1_0)
+    a, rows = world.map.arrays, world.map.rows(1)
+    features = Features(a.xy[rows], a.octave[rows], a.angle[rows], np.zeros(0), a.u_right[rows])
+    find = LearnedRelocalisation(world.images, CAMERA, CONFIG)
+    given = world.map, world.night, features, [LoopCandidate(-1, 0, 1.0)]
+    assert find(*given, None).keyframe == 0  # the camera may be anywhere
+    assert find(*given, LastSeen(1, 10.0)).keyframe == 0
+    assert find(*given, LastSeen(1, 0.01)) is None
+
+
 def test_pairs_join_without_repeating_a_feature_or_a_landmark():
     first = np.array([1, 2], np.int32), np.array([10, 20], np.int32)
     second = np.array([2, 3, 4], np.int32), np.array([30, 10, 40], np.int32)
     feature, landmark = joined(first, second)
     assert (feature.tolist(), landmark.tolist()) == ([1, 2, 4], [10, 20, 40])
-
-
-def test_each_feature_takes_the_nearest_pixel():
-    xy = np.array([[10.0, 10.0], [50.0, 10.0], [80.0, 10.0]], np.float32)
-    uv = np.array([[11.0, 10.0], [10.2, 10.0], [48.5, 10.0], [84.0, 10.0]])
-    octave = np.array([0, 0, 0], np.uint8)
-    feature, index = nearest_features(uv, xy, octave, 1.2 ** np.arange(8.0), CONFIG.learned)
-    assert sorted(zip(feature.tolist(), index.tolist(), strict=True)) == [(0, 1), (1, 2)]
-    one, _ = nearest_features(uv[:1], xy[[0, 0]], octave[:2], 1.2 ** np.arange(8.0), CONFIG.learned)
-    assert one.tolist() == [0]  # the finer one of two at the same pixel
-    none = nearest_features(uv[:0], xy, octave, np.ones(8), CONFIG.learned)
-    assert [len(x) for x in none] == [0, 0]
 
 
 def test_only_what_looks_alike_is_tried_and_less_after_a_try_in_vain():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vslam.features import CELL, FeatureGrid
+from vslam.features import CELL, FeatureGrid, nearest_features
 from vslam.frontend.matching import (
     Projections,
     Searchable,
@@ -317,3 +317,15 @@ def test_elsewhere_is_outside_the_fullest_third():
     u = np.random.default_rng(0).uniform(0, WIDTH, 200)
     fullest = max(np.count_nonzero((u >= c) & (u <= c + WIDTH / 3)) for c in u)
     assert count_elsewhere(u, WIDTH) == 200 - fullest
+
+
+def test_each_feature_takes_the_nearest_pixel():
+    xy = np.array([[10.0, 10.0], [50.0, 10.0], [80.0, 10.0]], np.float32)
+    uv = np.array([[11.0, 10.0], [10.2, 10.0], [48.5, 10.0], [84.0, 10.0]])
+    octave, scales = np.zeros(3, np.uint8), 1.2 ** np.arange(8.0)
+    feature, index = nearest_features(uv, xy, octave, scales, 2.0)
+    assert sorted(zip(feature.tolist(), index.tolist(), strict=True)) == [(0, 1), (1, 2)]
+    one, _ = nearest_features(uv[:1], xy[[0, 0]], octave[:2], scales, 2.0)
+    assert one.tolist() == [0]  # the finer one of two at the same pixel
+    none = nearest_features(uv[:0], xy, octave, scales, 2.0)
+    assert [len(x) for x in none] == [0, 0]

@@ -14,6 +14,7 @@ from vslam.datasets.perturbation import Perturbation
 from vslam.errors import UnreadableImageError
 from vslam.features import TrackingState
 from vslam.frontend.extraction import FrameImages
+from vslam.frontend.frame import Frame
 from vslam.frontend.orb import build_pyramid, level_shapes
 from vslam.frontend.patch_tracking import track_patches
 from vslam.frontend.pose_alignment import align_pose, coarse_levels, coarse_pyramid, coarse_shapes
@@ -134,6 +135,28 @@ def test_image_alignment_that_follows_a_moving_object_is_not_believed(corridor, 
     np.testing.assert_allclose(T_wc[:, :3, 3], expected[:, :3, 3], atol=0.05)
     by_patches = [sum(r.n_features == 0 for r in one) for one in (results, others)]
     assert by_patches[1] > 0.5 * by_patches[0]
+
+
+def test_a_keyframe_is_made_where_patches_are_found_even_if_no_descriptor_matches(
+    corridor, monkeypatch
+):
+    changed = []
+    extract = Frame.extract
+
+    def extract_in_another_light(frame, camera):
+        by_patches = frame.source is not None and len(frame.features) > 0
+        extract(frame, camera)
+        if by_patches and frame.index > 8 and not changed:
+            changed.append(frame.index)
+            frame.features = replace(frame.features, descriptors=~frame.features.descriptors)
+
+    monkeypatch.setattr(Frame, "extract", extract_in_another_light)
+    slam, results = driven(corridor)
+    (index,) = changed
+    assert results[index].is_keyframe
+    assert all(result.state == TrackingState.OK for result in results)
+    error = slam.trajectory().T_wc[:, :3, 3] - corridor.T_wc[:, :3, 3]
+    assert np.linalg.norm(error, axis=1).max() < 0.03
 
 
 def run(kitti_tree, threads=1, sequence=None):

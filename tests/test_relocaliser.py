@@ -17,11 +17,12 @@ from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.tracker import Found
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp, se3_log
-from vslam.loops import Localisation, LoopCandidate
+from vslam.loops import LastSeen, Localisation, LoopCandidate
 from vslam.map import Map
 
 HERE, NOT_HERE = 1, KEYFRAMES  # keyframes: one near the frame, and one without landmarks
 T_TRUE = forward(1.2, 0.3)
+LAST = LastSeen(2, 0.1)
 
 
 class Recognise:
@@ -39,8 +40,8 @@ class Recognise:
             landmark=np.arange(20, 20 + n, dtype=np.int32),
         )
 
-    def __call__(self, map_, image, features, candidates):
-        self.asked.append((map_, image, features, candidates))
+    def __call__(self, map_, image, features, candidates, last):
+        self.asked.append((map_, image, features, candidates, last))
         return self.localised if len(self.localised.feature) else None
 
 
@@ -73,7 +74,7 @@ class Place:
     def check(self, found: Found) -> Found:
         """Return what the relocaliser decides about the frame while no keyframe is being mapped."""
         return self.relocaliser.relocalise_if_needed(
-            self.frame, found, Owner(self.world.map, is_merged=True)
+            self.frame, found, Owner(self.world.map, is_merged=True), LAST
         )
 
     def find(self) -> Found:
@@ -159,7 +160,7 @@ def test_where_orb_finds_nothing_the_frame_may_be_recognised_in_another_way(matc
     assert len(recognise.asked) == 1
     for given, expected in zip(
         recognise.asked[0],
-        (place.world.map, frame.image, frame.features, place.candidates),
+        (place.world.map, frame.image, frame.features, place.candidates, LAST),
         strict=True,
     ):
         assert given is expected

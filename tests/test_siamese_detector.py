@@ -26,7 +26,7 @@ from vslam.config import Config, SiameseConfig
 from vslam.errors import InputError, ResultsError
 from vslam.features import Features
 from vslam.lab.loopbench.detectors import NetworkScorer
-from vslam.loopclosure.reach import beyond_reach
+from vslam.loopclosure.reach import beyond_reach, within_reach
 from vslam.loopclosure.registry import detector_with_images
 from vslam.loopclosure.siamese.detector import SiameseDetector, open_detector
 from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
@@ -43,7 +43,8 @@ from vslam.loopclosure.training.export import (
 from vslam.loopclosure.training.preprocessing import to_tensor
 from vslam.loopclosure.training.siamese import for_inference, load_network
 from vslam.loopclosure.verifier import verifier_for
-from vslam.map import PREDICTED, Map
+from vslam.loops import LastSeen
+from vslam.map import PREDICTED, UNPREDICTED, Map
 from vslam.map_kernels import link
 
 
@@ -250,6 +251,41 @@ def test_reach_grows_with_the_way_and_knows_nothing_of_lost_cameras_and_units():
     lost.parents[:] = [0, 0, 1, 2, 3]
     assert (beyond_reach(lost, 4, config)[:3] == 0).all()
     assert beyond_reach(lost, 4, config)[3] == pytest.approx(70 - 20 - 7)
+
+
+def test_a_lost_camera_reaches_more_the_longer_it_is_lost():
+    config = SiameseConfig(reach=20.0, reach_share=0.1, reach_speedup=2.0)
+    x = [0.0, 100.0, 200.0, 300.0]  # at 10 m/s
+    map_ = driven(x)
+    map_.timestamps[:] = [0.0, 10.0, 20.0, 30.0]
+
+    def reached(seconds: float) -> list[bool]:
+        return within_reach(map_, LastSeen(3, seconds), config).tolist()
+
+    assert reached(0.1) == [False, False, False, True]
+    # The limits are 30, 40 and 50 m without motion.
+    assert reached(3.4) == [False, False, False, True]
+    assert reached(3.6) == [False, False, True, True]
+    assert reached(12.6) == [True, True, True, True]
+    map_.keyframes.restart[3] = PREDICTED  # the camera was lost for 10 s before keyframe 3
+    map_.parents[:] = [0, 0, 1, 2]
+    assert reached(0.1) == [False, True, True, True]
+    map_.keyframes.restart[3] = UNPREDICTED
+    assert reached(0.1) == [True, True, True, True]
+    map_.keyframes.restart[3] = 0
+    map_.keyframes.session[2:] = 1  # other drives have their own clocks
+    map_.timestamps[2:] = [0.0, 10.0]
+    assert reached(0.1) == [True, True, False, True]
+
+
+def test_a_lost_monocular_camera_may_be_in_any_submap():
+    map_ = driven([0.0, 100.0, 200.0, 300.0], stereo=False)
+    map_.timestamps[:] = [0.0, 10.0, 20.0, 30.0]
+    config = SiameseConfig(monocular_reach_share=0.5)
+    assert within_reach(map_, LastSeen(3, 0.1), config).tolist() == [False, False, False, True]
+    map_.keyframes.restart[2] = PREDICTED
+    map_.parents[:] = [0, 0, 1, 2]
+    assert within_reach(map_, LastSeen(3, 0.1), config).tolist() == [True, True, False, True]
 
 
 def test_a_keyframe_that_looks_another_way_is_out_of_reach_if_the_way_between_is_known():

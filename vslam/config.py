@@ -202,6 +202,10 @@ class TrackingConfig(Section):
     searched for a second time. The first search begins at a pose that sparse image alignment has
     refined, and this alignment may have followed moving objects. The second search begins at the
     predicted pose. The result with more inliers is used. [own]"""
+    patch_feature_reach: float = Field(2.0, gt=0)
+    """If too few descriptors of a new keyframe match, each landmark whose patch was found is
+    matched to the nearest feature. The distance is at most this value, in pixels of the feature's
+    octave. [own]"""
     match_distance: int = Field(100, ge=0, le=256)
     """Upper bound of the descriptor distance when landmarks are matched near their projections, in
     bits. [OS1 V-D, customary]"""
@@ -736,6 +740,10 @@ class SiameseConfig(Section):
     """The query is compared only with keyframes whose viewing direction differs from that of the
     query by at most this value, in degrees. The detectors do not recognise a place that is seen
     from behind or from the side. [own]"""
+    reach_speedup: float = Field(5.0, ge=0)
+    """While the camera is lost, its speed is assumed to be at most this many times the mean speed
+    of the drive. If learned descriptors relocalise it, keyframes that it cannot have reached are
+    not tried. [own]"""
     embedded_at_once: int = Field(8, ge=1)
     """Upper bound of the number of keyframes that the network processes for one query. The nearest
     keyframes are chosen. [own]"""

@@ -50,6 +50,18 @@ class Localisation(NamedTuple):
     landmark: NDArray[np.int32]
 
 
+class LastSeen(NamedTuple):
+    """Where and when a camera was last tracked.
+
+    Attributes:
+        keyframe: the keyframe that it was tracked against.
+        elapsed_s: time since then, seconds.
+    """
+
+    keyframe: int
+    elapsed_s: float
+
+
 @dataclass(frozen=True)
 class LoopEdge:
     """The outcome of a loop candidate. Rejected candidates are kept for the report.

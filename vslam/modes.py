@@ -159,7 +159,9 @@ class MapBuilding(Mode):
             return True
         before = frame.snapshot()
         self._mapper.rig.extract(frame, frame.twist)
-        if frame.can_become_keyframe and self._tracker.match_features(frame, self._mapper.view):
+        if frame.can_become_keyframe and self._tracker.match_features(
+            frame, before, self._mapper.view
+        ):
             return True
         frame.restore(before)
         return False

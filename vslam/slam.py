@@ -287,7 +287,8 @@ class Slam:
         clock.lap("wait_for_mapping")
         if mapper.n_keyframes:
             tracked, T_predicted = self._track(frame, clock)
-            found = self._relocaliser.relocalise_if_needed(frame, tracked, mapper)
+            last = tracker.last_seen(frame.timestamp, mapper.view)
+            found = self._relocaliser.relocalise_if_needed(frame, tracked, mapper, last)
             if found is not tracked:
                 clock.lap("relocalise")
             placed = self._record_pose(frame, found, T_predicted)

@@ -235,8 +235,7 @@ def run_orbslam3(case: Case, system: OrbSlam3, folder: Path) -> Run:
     command = [str(system.python), str(SCRIPT), str(system.vocabulary)]
     command += [str(case.data / "sequences" / case.seq), "out", "--frames", str(case.frames)]
     process = measure(command, folder)
-    *_, costs = (line for line in process.output.splitlines() if line.startswith("{"))
-    report = json.loads(costs)
+    report = json.loads((folder / "out" / "costs.json").read_text())
     loops = process.output.count(LOOP_MESSAGE)
     return Run(process, report, report["lost"], loops, folder / "out" / "trajectory.txt")
 

@@ -6,10 +6,9 @@ The folder contains the left images in ``image_0``. It may also contain the righ
 ``image_1``, or 16-bit depth images in millimetres in ``depth``. Images of a single camera are
 tracked no faster than the camera took them.
 
-The script prints the costs of its frame loop as a JSON object, and writes them into
-``OUT/costs.json``. Waiting is not counted. The script imports nothing from vslam, because
-pyorbslam3 may be installed in another Python environment. The process ends when its standard input
-is closed.
+The costs of the frame loop are written into ``OUT/costs.json``. Waiting is not counted. The script
+imports nothing from vslam, because pyorbslam3 may be installed in another Python environment. The
+process ends when its standard input is closed.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 import threading
 import time
 from itertools import pairwise
@@ -134,9 +132,7 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
     _keep_first_of_each_time(tum)
     (out / "causal.txt").write_text("".join(_tum(t, T) for t, T in causal))
     (out / "states.txt").write_text("\n".join(states))
-    text = f"{json.dumps(costs)}\n"
-    (out / "costs.json").write_text(text)
-    sys.stdout.write(text)
+    (out / "costs.json").write_text(f"{json.dumps(costs)}\n")
 
 
 def _settings(folder: Path, image: Path, times: list[float], sensor: str) -> str:

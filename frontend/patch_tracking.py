@@ -51,6 +51,16 @@ class PatchTrack(NamedTuple):
         return len(self.ids) / max(1, self.n_matches)
 
 
+NO_PATCHES_FOUND = PatchTrack(
+    np.eye(4),
+    np.empty(0, np.int32),
+    np.empty((0, 3)),
+    Features.none(),
+    0,
+    np.empty(0, np.int32),
+)
+
+
 def track_patches(
     pyramid: Pyramid,
     T_cw: Matrix,

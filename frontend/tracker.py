@@ -12,7 +12,7 @@ from vslam.features import Extracted, TrackingState, TrackResult, nearest_featur
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
 from vslam.frontend.orb import level_shapes
-from vslam.frontend.patch_tracking import track_patches
+from vslam.frontend.patch_tracking import NO_PATCHES_FOUND, PatchTrack, track_patches
 from vslam.frontend.pose_alignment import align_pose, coarse_pyramid, coarse_shapes
 from vslam.frontend.tracking import (
     TrackingContext,
@@ -143,20 +143,20 @@ class Tracker:
         elapsed = timestamp - frames.timestamp(-1)
         return orthonormalised(se3_exp(self.twist * elapsed) @ T_last)
 
-    def track_patches(self, frame: Frame, T_cw: Matrix, view: MapView) -> Found:
+    def track_patches(self, frame: Frame, T_cw: Matrix, view: MapView) -> PatchTrack:
         """Track a frame using the image patches of landmarks, without extracting features.
 
-        The result is LOST if too few patches are found. It is also LOST if the frame cannot be
-        tracked in this way, for example because the previous frame was not tracked.
+        The frame is not changed. The result has no landmarks if the frame cannot be tracked in this
+        way, for example because the previous frame was not tracked.
 
         Args:
             T_cw: ``(4, 4)`` predicted pose (world to camera).
         """
         last, config = self.last, self._config.tracking
         if frame.pyramid is None or frame.source is None or not len(view.patches.ids):
-            return Found(TrackingState.LOST)
+            return NO_PATCHES_FOUND
         if last is None or last.twist is None or self.status is not TrackerStatus.TRACKING:
-            return Found(TrackingState.LOST)
+            return NO_PATCHES_FOUND
         camera, T_aligned = self._context.camera, T_cw
         if frame.coarse is not None and last.coarse is not None:
             size = camera.height, camera.width
@@ -173,14 +173,25 @@ class Tracker:
             # Image alignment may have followed moving objects.
             again = track_patches(frame.pyramid, T_cw, view, self._context, frame.mask)
             track = max(track, again, key=lambda one: len(one.ids))
-        n_inliers = len(track.ids)
-        if n_inliers < max(
-            config.patch_min_inliers, config.patch_min_inlier_ratio * track.n_matches
-        ):
-            return Found(TrackingState.LOST, track.n_matches, n_inliers)
+        return track
+
+    def judge_patches(self, track: PatchTrack) -> TrackingState:
+        """Decide whether a frame can be tracked by patches alone (OK), only if its features do not
+        match either (WEAK), or not at all (LOST)."""
+        config, n_inliers = self._config.tracking, len(track.ids)
+        trusted = config.patch_min_inlier_ratio * track.n_matches
+        if n_inliers >= max(config.patch_min_inliers, trusted):
+            return TrackingState.OK
+        plausible = config.patch_fallback_ratio * track.n_matches
+        if n_inliers >= max(config.min_inliers, plausible):
+            return TrackingState.WEAK
+        return TrackingState.LOST
+
+    def use_patches(self, frame: Frame, track: PatchTrack) -> Found:
+        """Give the result of tracking by patches to the frame."""
         frame.T_cw, frame.features = track.T_cw, track.features
         frame.landmark, frame.xyz = track.ids, track.xyz
-        return Found(TrackingState.OK, track.n_matches, n_inliers, track.visible)
+        return Found(self.judge_patches(track), track.n_matches, len(track.ids), track.visible)
 
     def match_features(self, frame: Frame, by_patches: Frame, view: MapView) -> bool:
         """Match the landmarks of the local map to the features of a frame that was tracked by

@@ -18,6 +18,7 @@ from vslam.frontend.frame import Frame
 from vslam.frontend.orb import build_pyramid, level_shapes
 from vslam.frontend.patch_tracking import track_patches
 from vslam.frontend.pose_alignment import align_pose, coarse_levels, coarse_pyramid, coarse_shapes
+from vslam.frontend.tracker import Tracker
 from vslam.frontend.tracking import TrackingContext, feature_depth
 from vslam.geometry import inverse, se3_exp, se3_log, transform
 from vslam.run.options import RunOptions
@@ -157,6 +158,32 @@ def test_a_keyframe_is_made_where_patches_are_found_even_if_no_descriptor_matche
     assert all(result.state == TrackingState.OK for result in results)
     error = slam.trajectory().T_wc[:, :3, 3] - corridor.T_wc[:, :3, 3]
     assert np.linalg.norm(error, axis=1).max() < 0.03
+
+
+@pytest.mark.parametrize(("share", "state"), [(0.6, TrackingState.WEAK), (0.4, TrackingState.LOST)])
+def test_patches_that_agree_less_are_used_only_where_features_fail(
+    corridor, monkeypatch, share, state
+):
+    def track(self, frame, *rest):
+        found = all_patches(self, frame, *rest)
+        return found._replace(n_matches=int(len(found.ids) / share)) if frame.index == 9 else found
+
+    def extract_nothing_known(frame, camera):
+        extract(frame, camera)
+        if frame.index == 9:
+            descriptors = ~frame.features.descriptors
+            frame.features = replace(frame.features, descriptors=descriptors)
+
+    all_patches, extract = Tracker.track_patches, Frame.extract
+    monkeypatch.setattr(Tracker, "track_patches", track)
+    _, by_features = driven(corridor, frames=11)
+    assert by_features[9].state == TrackingState.OK
+    assert by_features[9].n_features > 0
+    monkeypatch.setattr(Frame, "extract", extract_nothing_known)
+    _, results = driven(corridor, frames=11)
+    assert results[9].state == state
+    error = np.linalg.norm((inverse(results[9].T_wc) @ corridor.T_wc[9])[:3, 3])
+    assert state == TrackingState.LOST or error < 0.03
 
 
 def run(kitti_tree, threads=1, sequence=None):

@@ -197,6 +197,9 @@ class TrackingConfig(Section):
     patch_min_inlier_ratio: float = Field(0.8, ge=0, le=1)
     """Features are extracted for a frame if less than this fraction of its patches agree with its
     pose. This fraction falls below 0.8 among moving vehicles, but not in static scenes. [own]"""
+    patch_fallback_ratio: float = Field(0.5, ge=0, le=1)
+    """If the features of a frame do not match either, its pose is nevertheless found by patches if
+    at least this fraction of the patches agree with it. The frame is then WEAK. [own]"""
     patch_retry_ratio: float = Field(0.86, ge=0, le=1)
     """If less than this fraction of the patches agree with the pose of a frame, the patches are
     searched for a second time. The first search begins at a pose that sparse image alignment has

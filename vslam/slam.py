@@ -318,15 +318,21 @@ class Slam:
         """
         mapper, tracker = self._mapper, self._tracker
         T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
-        tracked = tracker.track_patches(frame, T_predicted, mapper.view)
-        if tracked.is_lost:
-            clock.lap("track")
-            self.rig.extract(frame, tracker.twist)
-            clock.lap("extract")
-            tracked = tracker.track(frame, T_predicted, mapper.view, mapper.frames)
+        by_patches = tracker.track_patches(frame, T_predicted, mapper.view)
+        state = tracker.judge_patches(by_patches)
+        clock.lap("track")
+        if state == TrackingState.OK:
+            return tracker.use_patches(frame, by_patches), T_predicted
+        before = frame.snapshot()
+        self.rig.extract(frame, tracker.twist)
+        clock.lap("extract")
+        tracked = tracker.track(frame, T_predicted, mapper.view, mapper.frames)
         if tracked.is_lost and self._mode.map_far_points():
             T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
             tracked = tracker.track(frame, T_predicted, mapper.view, mapper.frames)
+        if tracked.is_lost and state == TrackingState.WEAK:
+            frame.restore(before)
+            tracked = tracker.use_patches(frame, by_patches)
         clock.lap("track")
         return tracked, T_predicted
 

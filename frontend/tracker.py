@@ -183,7 +183,7 @@ class Tracker:
         if n_inliers >= max(config.patch_min_inliers, trusted):
             return TrackingState.OK
         plausible = config.patch_fallback_ratio * track.n_matches
-        if n_inliers >= max(config.min_inliers, plausible):
+        if n_inliers >= max(config.min_inliers_lost, plausible):
             return TrackingState.WEAK
         return TrackingState.LOST
 

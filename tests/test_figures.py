@@ -284,8 +284,10 @@ def test_tables_of_runs_are_compared_pairwise_with_one_pair_for_each_sequence(
 ):
     head = "dataset,sequence,excerpt,perturb,system,seed,alignment,frames,ate_rmse_m,rpe_m\n"
     drives = range(6)
-    ours = [f"kitti,{k},,none,both,{s},se3,9,{k}.{s},1.0\n" for k in drives for s in (1, 2, 9)]
-    theirs = [f"kitti,{k},,none,orbslam3,,se3,9,{k}.5,1.0\n" for k in drives]
+    ours = [f"kitti,{k},,none,both,{s},se3,9,{k}.{s},1.0\n" for k in drives for s in (0, 1, 2, 9)]
+    theirs = [
+        f"kitti,{k},,none,orbslam3,{s},se3,9,{k}.{s + 3},1.0\n" for k in drives for s in (0, 1, 2)
+    ]
     for name, rows in (("ours", ours), ("theirs", theirs)):
         (tmp_path / f"{name}.csv").write_text(head + "".join(rows))
     monkeypatch.syspath_prepend(str(ROOT / "tools"))

@@ -2,19 +2,21 @@
 
 python tools/paired_tests.py runs.csv [MORE ...] --out paired.csv
 
-The table has a row for each pair of systems, perturbation and measure. ``vslam bench`` prints the
-same tests for the runs in its folder.
+The table has a row for each pair of systems, perturbation and measure. Only runs on the same images
+are compared, so a seed of a perturbation counts only if both systems were run with it.
+``vslam bench`` prints the same tests for the runs in its folder.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+from itertools import combinations
 from pathlib import Path
 
 from vslam.lab.overview.collect import Found
 from vslam.lab.overview.schema import DECIMALS, Comparison, Drive, RunEntry
-from vslam.lab.overview.summary import summarize
+from vslam.lab.overview.summary import summarize, systems
 
 
 def main() -> None:
@@ -23,7 +25,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     runs = [run for path in options.tables for run in read_runs(path)]
-    rows = [row_of(one) for one in summarize(Found(runs, [])).comparisons]
+    pairs = combinations(systems(runs), 2)
+    rows = [row_of(one) for first, second in pairs for one in compared(runs, first, second)]
     with options.out.open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, rows[0], lineterminator="\n")
         table.writeheader()
@@ -46,6 +49,16 @@ def read_runs(path: Path) -> list[RunEntry]:
             )
             for row in csv.DictReader(file)
         ]
+
+
+def compared(runs: list[RunEntry], first: str, second: str) -> list[Comparison]:
+    images = [{(one.drive, one.seed) for one in runs if one.system == x} for x in (first, second)]
+    both = [
+        one
+        for one in runs
+        if one.system in (first, second) and (one.drive, one.seed) in images[0] & images[1]
+    ]
+    return summarize(Found(both, [])).comparisons if both else []
 
 
 def row_of(found: Comparison) -> dict[str, object]:

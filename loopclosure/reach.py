@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import SiameseConfig
+from vslam.geometry import inverses
 from vslam.loops import LastSeen
 from vslam.map import Map
 
@@ -34,7 +35,7 @@ def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.
         ``(n_keyframes,)`` float64, in the unit of the map. The value is at most 0 for keyframes
         within reach, and infinite for keyframes with a different viewing direction.
     """
-    beyond = _distances_beyond_reach(map_, keyframe, config)
+    beyond = _distances_beyond_reach(map_, keyframe, _positions(map_), config)
     direction = map_.arrays.T_cw[: map_.n_keyframes, 2, :3]  # in the world frame
     beyond[direction @ direction[keyframe] < np.cos(np.radians(config.reach_angle))] = np.inf
     beyond[_in_other_submap(map_, keyframe)] = 0.0
@@ -52,38 +53,41 @@ def within_reach(map_: Map, last: LastSeen, config: SiameseConfig) -> NDArray[np
     The viewing direction is not limited. Keyframes of other drives are always within reach. This is
     also true of keyframes of other sub-maps if their poses relative to the camera are unknown.
     """
-    living = map_.living_keyframes()
-    drive = map_.sessions[living]
-    elapsed = np.where(np.diff(drive) == 0, np.diff(map_.timestamps[living]), 0.0)
-    steps = np.where(np.diff(drive) == 0, _steps(map_, living), 0.0)
+    living, position = map_.living_keyframes(), _positions(map_)
+    same_drive = np.diff(map_.sessions[living]) == 0
+    elapsed = np.where(same_drive, np.diff(map_.timestamps[living]), 0.0)
+    steps = np.where(same_drive, _steps(position[living]), 0.0)
     if elapsed.sum() <= 0.0:
         return np.ones(map_.n_keyframes, np.bool_)
     restarts = map_.keyframes.restart[living[1:]] != 0
-    lost_s = np.zeros(map_.n_keyframes)  # time for which the camera was lost until each keyframe
-    lost_s[living[1:]] = np.where(restarts, elapsed, 0.0)
-    lost_s = np.cumsum(lost_s)
-    lost_s = np.abs(lost_s - lost_s[last.keyframe]) + last.elapsed_s
+    lost_s = _between(map_, last.keyframe, np.where(restarts, elapsed, 0.0)) + last.elapsed_s
     travelled = config.reach_speedup * steps.sum() / elapsed.sum() * lost_s
-    beyond = _distances_beyond_reach(map_, last.keyframe, config) - travelled
+    beyond = _distances_beyond_reach(map_, last.keyframe, position, config) - travelled
     unknown = map_.sessions != map_.sessions[last.keyframe]
     if map_.unpredicted_restarts or not _is_metric(map_, last.keyframe):
         unknown |= _in_other_submap(map_, last.keyframe)
     return (beyond <= 0.0) | unknown
 
 
-def _distances_beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.float64]:
-    living = map_.living_keyframes()
-    moved = np.zeros(map_.n_keyframes)
-    moved[living[1:]] = _steps(map_, living)
-    odometer = np.cumsum(moved)
-    driven = np.abs(odometer[keyframe] - odometer)
-    position = _positions(map_)
+def _distances_beyond_reach(
+    map_: Map, keyframe: int, position: NDArray[np.float64], config: SiameseConfig
+) -> NDArray[np.float64]:
+    driven = _between(map_, keyframe, _steps(position[map_.living_keyframes()]))
     distance = np.linalg.norm(position - position[keyframe], axis=1)
     if _is_metric(map_, keyframe):
         beyond = distance - config.reach - config.reach_share * driven
     else:
         beyond = distance - config.monocular_reach_share * driven
     return np.asarray(beyond, np.float64)
+
+
+def _between(map_: Map, keyframe: int, steps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum up a quantity along the drive, between a keyframe and each keyframe of the map. ``steps``
+    are its values between consecutive keyframes that have not been culled."""
+    at_keyframe = np.zeros(map_.n_keyframes)
+    at_keyframe[map_.living_keyframes()[1:]] = steps
+    total = np.cumsum(at_keyframe)
+    return np.asarray(np.abs(total - total[keyframe]), np.float64)
 
 
 def _is_metric(map_: Map, keyframe: int) -> bool:
@@ -98,10 +102,8 @@ def _in_other_submap(map_: Map, keyframe: int) -> NDArray[np.bool_]:
 
 
 def _positions(map_: Map) -> NDArray[np.float64]:
-    T = map_.arrays.T_cw[: map_.n_keyframes]
-    return np.asarray(-np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3]), np.float64)
+    return inverses(map_.arrays.T_cw[: map_.n_keyframes])[:, :3, 3]
 
 
-def _steps(map_: Map, living: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the distances between consecutive keyframes."""
-    return np.asarray(np.linalg.norm(np.diff(_positions(map_)[living], axis=0), axis=1), np.float64)
+def _steps(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.linalg.norm(np.diff(position, axis=0), axis=1), np.float64)

@@ -239,7 +239,8 @@ class KeyframePolicy:
         self._state = replace(self._state, due=-1)
         return True
 
-    def keyframe_made(self) -> None:
+    def reference_renewed(self) -> None:
+        """Note that a keyframe was inserted, or that an existing one became the reference."""
         self._state = replace(self._state, gain_awaited=True, due=-1)
 
     def state(self) -> PolicyState:

@@ -3,7 +3,8 @@ are aligned to these patches with sub-pixel accuracy.
 
 Older patches are discarded. They are rarely needed, because the newest keyframes observe nearly all
 landmarks that are being tracked. In addition, a patch takes more memory than the rest of an
-observation.
+observation. At a known place, where old keyframes observe the landmarks, patches are taken from a
+frame that returned to this place.
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ from vslam.features import (
     PATCH_PIXELS,
     PATCH_RADIUS,
     PATCH_SIDE,
+    FramePatches,
     KeyframePatches,
     LandmarkPatches,
     Pyramid,
     level_pixel,
 )
 from vslam.frontend.frame import Frame
+from vslam.geometry import Matrix
 from vslam.kernels import kernel
 from vslam.map import Map
 
@@ -57,6 +60,61 @@ def _cut(pixels, offsets, shapes, xy, octave):
     return patches
 
 
+def _patches_of(
+    frame: Frame, chosen: NDArray[np.int64], scales: NDArray[np.float64]
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Return the patches around some features of a frame as ``KeyframePatches.pixels`` and
+    ``shift``. The frame must have a pyramid."""
+    assert frame.pyramid is not None
+    octave, shift = frame.features.octave[chosen], np.zeros((len(chosen), 2), np.float32)
+    if frame.shift is not None:
+        aligned = frame.aligned[chosen]
+        shift[aligned] = frame.shift[chosen[aligned]] / scales[octave[aligned]][:, None]
+    return patches_around(frame.pyramid, frame.features.xy[chosen], octave), shift
+
+
+def patches_of_frame(frame: Frame, scales: NDArray[np.float64]) -> FramePatches | None:
+    """Cut out the patches of the landmarks that a frame tracks. None if it has no pyramid.
+
+    Args:
+        scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
+    """
+    if frame.pyramid is None:
+        return None
+    tracked = np.flatnonzero(frame.landmark >= 0)
+    tracked = tracked[np.argsort(frame.landmark[tracked])]
+    return FramePatches(
+        frame.index,
+        frame.landmark[tracked],
+        frame.features.octave[tracked],
+        frame.features.angle[tracked],
+        *_patches_of(frame, tracked, scales),
+    )
+
+
+def patches_of_landmarks(
+    patches: FramePatches, ids: NDArray[np.int32], T_cw: Matrix, scales: NDArray[np.float64]
+) -> LandmarkPatches:
+    """Look up the patches of landmarks among those of a frame. Landmarks without one are omitted.
+
+    Args:
+        ids: ``(L,)`` ids of the landmarks, sorted.
+        T_cw: ``(4, 4)`` pose of the frame.
+        scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
+    """
+    known, where, _ = np.intersect1d(patches.landmark, ids, assume_unique=True, return_indices=True)
+    return LandmarkPatches(
+        known,
+        where,
+        np.zeros(len(known), np.int64),
+        scales[patches.octave[where]],
+        patches.angle[where],
+        patches.pixels,
+        patches.shift,
+        T_cw[None],
+    )
+
+
 class RecentPatches:
     """Stores the image patches around the features of the newest ``capacity`` keyframes.
 
@@ -77,15 +135,9 @@ class RecentPatches:
             keyframe: id of the new keyframe.
             scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
         """
-        features = frame.features
-        if frame.pyramid is None:
-            return
-        shift = np.zeros((len(features), 2), np.float32)
-        if frame.shift is not None:
-            aligned = frame.aligned
-            shift[aligned] = frame.shift[aligned] / scales[features.octave[aligned]][:, None]
-        pixels = patches_around(frame.pyramid, features.xy, features.octave)
-        self.add(KeyframePatches(keyframe, pixels, shift))
+        if frame.pyramid is not None:
+            everything = np.arange(len(frame.features))
+            self.add(KeyframePatches(keyframe, *_patches_of(frame, everything, scales)))
 
     def add(self, patches: KeyframePatches) -> None:
         """Store the patches of one keyframe. If the store is full, they replace the patches of the

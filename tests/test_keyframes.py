@@ -209,7 +209,7 @@ def test_points_without_a_depth_are_not_close():
 def test_only_the_first_frame_after_a_keyframe_tells_what_keyframes_gain():
     one = policy()
     assert observe(one, frame(close=10)).gained_close == 200.0  # no keyframe was made
-    one.keyframe_made()
+    one.reference_renewed()
     # The value counts at once. It is a fifth of the way from 200 to 10.
     assert observe(one, frame(close=10)).gained_close == pytest.approx(162.0)
     assert observe(one, frame(close=40)).gained_close == pytest.approx(162.0)
@@ -233,7 +233,7 @@ def test_a_keyframe_is_planned_for_the_frame_that_will_have_lost_too_many_close_
     assert one.due == -1
     assert not one.is_due(14, replace(losing, tracked_close=490))
     assert one.due == 15
-    one.keyframe_made()
+    one.reference_renewed()
     assert one.is_due(16, replace(losing, tracked_close=390))  # there is no time to plan
 
 
@@ -249,7 +249,7 @@ def test_a_planned_keyframe_is_made_at_once_if_few_landmarks_are_left(n_inliers,
 
 def test_close_points_are_lost_from_the_first_frame_after_a_keyframe_on():
     one = policy()
-    one.keyframe_made()
+    one.reference_renewed()
     seen = frame(close=20)
     assert observe(one, seen).close_ratio == 1.0
     seen = frame(close=5)
@@ -262,7 +262,7 @@ def test_close_points_are_lost_from_the_first_frame_after_a_keyframe_on():
 def test_deciding_changes_nothing(awaited):
     one = policy()
     if awaited:
-        one.keyframe_made()
+        one.reference_renewed()
     before = one.state()
     assert not one.wants_keyframe(CONTENT)
     assert one.wants_keyframe(replace(CONTENT, seconds_since_keyframe=1.0))
@@ -316,10 +316,10 @@ def test_a_policy_knows_a_place_by_what_it_shares(n_shared, known):
 @pytest.mark.parametrize("awaited", [True, False])
 def test_a_policy_that_is_restored_goes_on_as_the_one_that_was_not(awaited):
     one = policy()
-    one.keyframe_made()
+    one.reference_renewed()
     observe(one, frame(close=10))
     if awaited:
-        one.keyframe_made()
+        one.reference_renewed()
     other = policy()
     other.restore(one.state())
     assert other.state() == one.state()

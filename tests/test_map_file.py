@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import valid_files
 from ring import CAMERA, Ring
 
 from vslam.config import Config, OrbConfig
@@ -468,6 +469,48 @@ def alive_that_died(file: Path, to: Path) -> Path:
 )
 def test_a_damaged_checkpoint_is_refused(apply, at_checkpoint, tmp_path):
     assert "damaged" in refusal(apply(at_checkpoint, tmp_path / "hand.npz"))
+
+
+@pytest.fixture(scope="module")
+def at_known_place(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("known")
+    valid_files.map_file(folder)
+    return folder / "map.npz"
+
+
+def test_the_patches_of_a_known_place_come_back(at_known_place, tmp_path):
+    stored = load_checkpoint(at_known_place)
+    known_place = stored.checkpoint.mapper.known_place
+    with np.load(at_known_place) as data:
+        for name, values in known_place._asdict().items():
+            wanted = 2 if name == "frame" else data[f"checkpoint_place_{name}"]
+            np.testing.assert_array_equal(values, wanted)
+    save_map(tmp_path / "again.npz", stored, resumable=True)
+    assert (tmp_path / "again.npz").read_bytes() == at_known_place.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "apply",
+    [
+        damage("checkpoint_place_landmark", (0,), 11),
+        damage("checkpoint_place_landmark", (9,), 10**6),
+        damage("checkpoint_place_landmark", (0,), -1),
+        damage("checkpoint_place_octave", (3,), 8),
+        damage("checkpoint_place_angle", (3,), np.inf),
+        damage("checkpoint_place_shift", (3, 0), np.nan),
+        entry("mapper", known_place=3),
+        entry("mapper", known_place="last"),
+    ],
+)
+def test_damaged_patches_of_a_known_place_are_refused(apply, at_known_place, tmp_path):
+    assert "damaged" in refusal(apply(at_known_place, tmp_path / "hand.npz"))
+
+
+def test_a_checkpoint_of_an_earlier_version_has_no_known_place(at_checkpoint, tmp_path):
+    header = header_of(at_checkpoint)
+    del header["checkpoint"]["mapper"]["known_place"]
+    older = changed(at_checkpoint, tmp_path / "older.npz", header=as_header(header))
+    assert load_checkpoint(older).checkpoint.mapper.known_place is None
 
 
 def test_a_drive_that_has_made_no_keyframe_yet_is_resumed(at_checkpoint, tmp_path):

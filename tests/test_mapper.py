@@ -15,6 +15,8 @@ from vslam.closing import LoopSearch
 from vslam.config import Config
 from vslam.features import PATCH_PIXELS, Extracted, Features, KeyframePatches
 from vslam.frontend.frame import Frame
+from vslam.frontend.orb import build_pyramid
+from vslam.frontend.patches import patches_around
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext, track_local_map
 from vslam.geometry import inverse, se3_exp
@@ -534,6 +536,42 @@ def test_an_old_keyframe_can_serve_in_place_of_a_new_one(is_due):
     drive.step()  # two frames later
     assert drive.closing.finished == is_due
     assert mapper.is_merged
+
+
+def with_an_image(frame):
+    """Give a frame the pyramid of an image of noise, from which patches can be taken."""
+    image = np.random.default_rng(0).integers(0, 256, (CAMERA.height, CAMERA.width), np.uint8)
+    frame.pyramid = build_pyramid(image, Config().orb)
+    return frame
+
+
+def test_at_a_known_place_the_patches_are_those_of_the_frame_until_the_next_keyframe():
+    drive = Drive(known_after_s=0.3)
+    drive.steps([0, 3], 6)
+    mapper, frame = drive.mapper, with_an_image(drive.last)
+    mapper.use_existing_keyframe(mapper.find_old_place(frame), frame)
+    shown = mapper.view.patches
+    tracked = np.flatnonzero(np.isin(frame.landmark, mapper.view.local_landmarks.ids))
+    of_frame = dict(zip(frame.landmark[tracked].tolist(), tracked.tolist(), strict=True))
+    assert shown.ids.tolist() == sorted(of_frame)
+    feature = np.array([of_frame[k] for k in shown.ids.tolist()])
+    np.testing.assert_array_equal(
+        shown.pixels[shown.where],
+        patches_around(frame.pyramid, frame.features.xy[feature], frame.features.octave[feature]),
+    )
+    np.testing.assert_array_equal(shown.angle, frame.features.angle[feature])
+    np.testing.assert_allclose(shown.T_cw[shown.view[0]], frame.T_cw, atol=1e-12)
+
+    again = Mapper(
+        drive.context, drive.closing, drive.rig, Workers(1), mapper.map.copy(),
+        mapper.frames.table(),
+    )  # fmt: skip
+    again.restore(mapper.state())
+    assert bytes_of_view(again.view) == bytes_of_view(mapper.view)
+
+    drive.step(keyframe=True)
+    assert mapper.state().known_place is None
+    assert not len(mapper.view.patches.ids)  # the keyframes of this drive have no images
 
 
 def test_far_points_are_mapped_of_the_first_keyframe_while_it_is_the_only_one():

@@ -250,12 +250,34 @@ def test_a_frame_that_is_not_urgent_waits_for_mapping(idle, made):
 def test_at_an_old_place_no_keyframe_is_made(known_after_s, known):
     drive = Building.with_a_map(max_interval_s=0.05, known_after_s=known_after_s)
     frame = drive.placed_frame()
-    before = drive.mode.state()
+    drive.mode.restore(PolicyState(100.0, gain_awaited=False))
     assert drive.mode.update_map(frame, found(frame)) != known
     assert drive.mapper.n_keyframes == (2 if known else 3)
     assert drive.mapper.reference == (0 if known else 2)
     assert drive.mapper.last_timestamp == frame.timestamp
-    assert (drive.mode.state() == before) == known
+    assert drive.mode.state().gain_awaited  # the next frame is compared with this one
+
+
+def test_a_place_is_known_by_the_features_of_a_frame_that_was_tracked_by_patches():
+    """Few patches are left of an old place. A frame that returns there matches more features."""
+    drive = Building.with_a_map(max_interval_s=0.05, known_after_s=0.5)
+    frame = drive.placed_frame()
+    features, landmark, xyz = frame.features, frame.landmark.copy(), frame.xyz.copy()
+    few = np.flatnonzero(landmark >= 0)[:40]
+    frame.landmark, frame.xyz = np.full_like(landmark, -1), np.full_like(xyz, np.nan)
+    frame.landmark[few], frame.xyz[few] = landmark[few], xyz[few]
+    frame.source = object()
+
+    def match(frame: Frame) -> bool:
+        frame.source, frame.features = None, features
+        frame.landmark, frame.xyz = landmark, xyz
+        return True
+
+    drive.mode._match_features = match
+    drive.mode.restore(PolicyState(100.0, gain_awaited=False, due=frame.index))
+    assert not drive.mode.update_map(frame, found(frame))
+    assert drive.mapper.n_keyframes == 2
+    assert drive.mapper.reference == 0
 
 
 @pytest.mark.parametrize(("n_tracked", "n_shared", "n_place", "known"), [

@@ -174,7 +174,7 @@ def video(folder: Path) -> None:
 
 
 def map_file(folder: Path) -> None:
-    from vslam.features import PATCH_PIXELS, Features, KeyframePatches
+    from vslam.features import PATCH_PIXELS, Features, FramePatches, KeyframePatches
     from vslam.frame_poses import FrameTable
     from vslam.loops import LoopEdge, ResembledPlace
     from vslam.map import Map
@@ -215,9 +215,17 @@ def map_file(folder: Path) -> None:
     patches = KeyframePatches(
         2, np.zeros((n, PATCH_PIXELS), np.uint8), np.zeros((n, 2), np.float32)
     )
+    known_place = FramePatches(
+        2,
+        ids[2:].astype(np.int32),
+        features.octave[2:],
+        features.angle[2:],
+        patches.pixels[2:],
+        patches.shift[2:],
+    )
     checkpoint = Checkpoint(
         TrackerState(2, 0.2, features, ids.astype(np.int32), np.eye(4), np.zeros(6), 0, n),
-        MapperState(2, 2, 0.2, (patches,)),
+        MapperState(2, 2, 0.2, (patches,), known_place),
         PolicyState(100.0, False),
         ClosingState(ConsistencyState((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3)),
     )

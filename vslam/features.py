@@ -149,20 +149,40 @@ class KeyframePatches(NamedTuple):
     shift: NDArray[np.float32]
 
 
+class FramePatches(NamedTuple):
+    """Image patches of the N landmarks that a frame tracks.
+
+    Attributes:
+        frame: index of the frame.
+        landmark: ``(N,)`` int32 landmark ids, sorted.
+        octave: ``(N,)`` uint8, octave of the feature that tracks each landmark.
+        angle: ``(N,)`` float32, orientation of this feature in radians.
+        pixels: ``(N, PATCH_PIXELS)`` uint8, see ``KeyframePatches``.
+        shift: ``(N, 2)`` float32, see ``KeyframePatches``.
+    """
+
+    frame: int
+    landmark: NDArray[np.int32]
+    octave: NDArray[np.uint8]
+    angle: NDArray[np.float32]
+    pixels: NDArray[np.uint8]
+    shift: NDArray[np.float32]
+
+
 class LandmarkPatches(NamedTuple):
-    """Image patches of N landmarks, taken from K keyframes.
+    """Image patches of N landmarks, taken from K frames.
 
     Attributes:
         ids: ``(N,)`` int32 landmark ids, sorted.
         where: ``(N,)`` int64, index of the patch of each landmark in ``pixels`` and ``shift``.
-        view: ``(N,)`` int64, index in ``T_cw`` of the keyframe that the patch of each landmark was
+        view: ``(N,)`` int64, index in ``T_cw`` of the frame that the patch of each landmark was
             taken from.
         size: ``(N,)`` float64, size of a pixel of the patch in full-resolution pixels.
         angle: ``(N,)`` float32, orientation of the feature in radians.
         pixels: ``(P, PATCH_PIXELS)`` uint8, the square patch around each keypoint, row by row.
         shift: ``(P, 2)`` float32, vector from each keypoint to the position of its landmark after
             sub-pixel alignment, in pixels of the keypoint's octave.
-        T_cw: ``(K, 4, 4)`` float64 poses of the keyframes.
+        T_cw: ``(K, 4, 4)`` float64 poses of the frames.
     """
 
     ids: NDArray[np.int32]

@@ -129,7 +129,7 @@ class FramePoses:
         self._n += 1
         self._frames.timestamp[self._n - 1] = timestamp
         self._frames.tracked[self._n - 1] = tracked
-        self.follow_reference(self._n - 1, T_cw)
+        self.follow(self._n - 1, self._keyframes.reference, T_cw)
 
     def replace(self, index: int, keyframe: int) -> None:
         """Set the pose of a frame that became a keyframe to the pose of that keyframe."""
@@ -137,12 +137,12 @@ class FramePoses:
         self._frames.tracked[self._number(index)] = True
         self._set(index, keyframe, np.eye(4), unit)
 
-    def follow_reference(self, index: int, T_cw: Matrix) -> None:
-        """Store the pose ``T_cw`` of a frame relative to the current reference keyframe."""
-        keyframes = self._keyframes
-        reference = keyframes.reference
-        T_rw = keyframes.keyframe_pose(reference) if keyframes.n_keyframes else np.eye(4)
-        self._set(index, reference, orthonormalised(T_cw @ inverse(T_rw)), self.unit)
+    def follow(self, index: int, keyframe: int, T_cw: Matrix) -> None:
+        """Store the pose ``T_cw`` of a frame relative to a keyframe."""
+        keyframes, T_kw, unit = self._keyframes, np.eye(4), 1.0
+        if keyframes.n_keyframes:
+            T_kw, unit = keyframes.keyframe_pose(keyframe), keyframes.unit_scale(keyframe)
+        self._set(index, keyframe, orthonormalised(T_cw @ inverse(T_kw)), unit)
 
     def _set(self, index: int, reference: int, T_c_reference: Matrix, unit: float) -> None:
         index = self._number(index)

@@ -22,9 +22,15 @@ from vslam.backend.disparity_offset import map_and_calibrate, offset_sigma
 from vslam.backend.local_mapping import refresh_keyframe
 from vslam.backend.triangulation import map_stereo_points
 from vslam.closing import LoopClosing, LoopSearch
+from vslam.features import FramePatches
 from vslam.frame_poses import FramePoses, FrameTable
 from vslam.frontend.frame import Frame, PlacedFrame
-from vslam.frontend.patches import RecentPatches, certainty_of
+from vslam.frontend.patches import (
+    RecentPatches,
+    certainty_of,
+    patches_of_frame,
+    patches_of_landmarks,
+)
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, inverse, orthonormalised
@@ -88,6 +94,7 @@ class Mapper:
         self._closing = closing
         self.rig = rig
         self._patches = RecentPatches(context.config.alignment.keyframes)
+        self._known_place: FramePatches | None = None
         self._is_merged = True
         self._next_search: Callable[[Map], LoopSearch] | None = None  # starts after the merge
         self._search: Job[LoopSearch] | None = None
@@ -207,7 +214,7 @@ class Mapper:
         if age >= self._config.keyframes.merge_after_frames:
             self._merge_mapping()
         if age >= _CLOSE_AFTER_FRAMES:
-            self._settle()
+            self.settle()
 
     def merge(self) -> Map:
         """Make the result of the mapping job visible to tracking, and return the map.
@@ -247,7 +254,7 @@ class Mapper:
             self._renew_view()
             self._start_search()
 
-    def _settle(self) -> Map:
+    def settle(self) -> Map:
         """Merge the mapping job, close the loop if one was found, and return the map."""
         map_ = self.merge()
         if self._search is not None:
@@ -339,14 +346,15 @@ class Mapper:
 
     def find_old_place(self, frame: Frame) -> OldPlace | None:
         """Find a place that was mapped some time ago and to which the frame has returned."""
-        return find_old_place(self._settle(), frame, self._config.keyframes.known_after_s)
+        return find_old_place(self.settle(), frame, self._config.keyframes.known_after_s)
 
     def use_existing_keyframe(self, place: OldPlace, frame: PlacedFrame) -> None:
         """Make an existing keyframe the reference keyframe instead of inserting a new keyframe."""
-        self._settle()
+        map_ = self.settle()
         self.last_timestamp = frame.timestamp
+        self.frames.follow(frame.index, place.keyframe, frame.T_cw)
+        self._known_place = patches_of_frame(frame, map_.scales)
         self.refer_to(place.keyframe)
-        self.frames.follow_reference(frame.index, frame.T_cw)
         if self._closing.count_reused_keyframe(self.n_keyframes - 1):
             self.last_frame = frame.index
             self._start(self._closing.finish)
@@ -357,7 +365,11 @@ class Mapper:
         """Make a keyframe the reference keyframe, so that tracking sees the landmarks around it."""
         map_, config = self.map, self._config.tracking
         local = local_map(map_, keyframe, config.local_keyframes)
-        patches = self._patches.of(map_, local.ids)
+        if (place := self._known_place) is None:
+            patches = self._patches.of(map_, local.ids)
+        else:
+            T_cw = self.frames.pose(place.frame)
+            patches = patches_of_landmarks(place, local.ids, T_cw, map_.scales)
         self.view = view_of(map_, keyframe, local, patches, monocular=self._camera.monocular)
         known = map_.scalars
         self.rig.disparity_offset = known.disparity_offset
@@ -375,7 +387,11 @@ class Mapper:
     def state(self) -> MapperState:
         """Return the state of the mapper for a checkpoint, without the map."""
         return MapperState(
-            self.reference, self.last_frame, self.last_timestamp, self._patches.all()
+            self.reference,
+            self.last_frame,
+            self.last_timestamp,
+            self._patches.all(),
+            self._known_place,
         )
 
     def restore(self, state: MapperState) -> None:
@@ -383,6 +399,7 @@ class Mapper:
         self.last_frame, self.last_timestamp = state.last_frame, state.last_timestamp
         for patches in state.patches:
             self._patches.add(patches)
+        self._known_place = state.known_place
         self.refer_to(state.reference)
 
     def continue_drive(self) -> None:
@@ -395,7 +412,7 @@ class Mapper:
     @contextmanager
     def _changing(self) -> Iterator[Map]:
         """Yield the merged map for changes. An exception in the block makes the map unusable."""
-        self._settle()
+        self.settle()
         with self._shared.change() as map_:
             yield map_
 
@@ -410,6 +427,7 @@ class Mapper:
     def _set_newest(self, keyframe: int, frame: Frame) -> None:
         map_ = self.map
         self._patches.remember(frame, keyframe, map_.scales)
+        self._known_place = None
         self.last_frame, self.last_timestamp = frame.index, frame.timestamp
         self.refer_to(keyframe)
         observe_keyframe(frame, map_, keyframe)

@@ -96,7 +96,7 @@ class MapBuilding(Mode):
         if isinstance(start, OneViewStart):
             frame.landmark[:] = -1
             self._mapper.insert(frame, predicted=self._tracker.twist is not None)
-            self.policy.keyframe_made()
+            self.policy.reference_renewed()
         else:
             self._mapper.begin(start, lambda: self._tracker.twist)
             self.starter.reset()
@@ -130,24 +130,29 @@ class MapBuilding(Mode):
         )
         if not self._is_keyframe(frame, evidence):
             return False
-        place = self._mapper.find_old_place(frame)
-        if place is not None:
-            n_inliers = int(np.count_nonzero(frame.landmark >= 0))
-            if self.policy.is_known(
-                n_inliers=n_inliers, n_shared=place.n_shared, n_place=place.n_place
-            ):
-                self._mapper.use_existing_keyframe(place, frame)
-                return False
-        if not self._match_features(frame):
+        self._mapper.settle()
+        if not self._match_features(frame) or self._uses_existing_keyframe(frame):
             return False
         self._mapper.insert(frame)
-        self.policy.keyframe_made()
+        self.policy.reference_renewed()
         return True
 
     def _is_keyframe(self, frame: PlacedFrame, evidence: KeyframeEvidence) -> bool:
         if frame.source is None:
             return self.policy.wants_keyframe(evidence)
         return self.policy.is_due(frame.index, evidence)
+
+    def _uses_existing_keyframe(self, frame: PlacedFrame) -> bool:
+        """If the place is known, make an existing keyframe the reference keyframe."""
+        place = self._mapper.find_old_place(frame)
+        n_inliers = int(np.count_nonzero(frame.landmark >= 0))
+        if place is None or not self.policy.is_known(
+            n_inliers=n_inliers, n_shared=place.n_shared, n_place=place.n_place
+        ):
+            return False
+        self._mapper.use_existing_keyframe(place, frame)
+        self.policy.reference_renewed()
+        return True
 
     def _match_features(self, frame: PlacedFrame) -> bool:
         """Match the features of a frame that was tracked by patches.

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import Features, KeyframePatches
+from vslam.features import Features, FramePatches, KeyframePatches
 from vslam.geometry import Matrix
 from vslam.loops import LoopEdge, ResembledPlace
 from vslam.odometry import Odometry
@@ -55,12 +55,15 @@ class MapperState:
         last_frame, last_timestamp: index and time (seconds) of the frame that became the last
             keyframe.
         patches: image patches of the newest keyframes, oldest first.
+        known_place: image patches of the last frame at which an existing keyframe was used instead
+            of inserting a new one; None if a keyframe has been inserted since then.
     """
 
     reference: int
     last_frame: int
     last_timestamp: float
     patches: tuple[KeyframePatches, ...]
+    known_place: FramePatches | None = None
 
 
 @dataclass(frozen=True)

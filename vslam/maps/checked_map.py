@@ -26,8 +26,7 @@ from vslam.map import (
     Map,
     Scalars,
 )
-from vslam.maps.checkpoint import ARRAYS as CHECKPOINT_ARRAYS
-from vslam.maps.checkpoint import checked_checkpoint
+from vslam.maps.checkpoint import arrays_of, checked_checkpoint
 from vslam.maps.stored_map import StoredMap, TruthAlignment, observations
 
 # These columns are not in the file. They are computed from keyframe_first_row and from the list of
@@ -106,7 +105,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
     map_.scalars = _scalars(header["scalars"])
     checkpoint = None
     if header["checkpoint"] is not None:
-        arrays = {name: data[f"checkpoint_{name}"] for name in CHECKPOINT_ARRAYS}
+        arrays = {name: data[f"checkpoint_{name}"] for name in arrays_of(header["checkpoint"])}
         checkpoint = checked_checkpoint(
             arrays, header["checkpoint"], map_, sizes["F"] if header["frames"] else 0
         )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import PATCH_PIXELS, Features, KeyframePatches
+from vslam.features import PATCH_PIXELS, Features, FramePatches, KeyframePatches
 from vslam.loops import ResembledPlace, loop_entry, loop_of
 from vslam.map import Map
 from vslam.odometry import N_STATE
@@ -37,6 +37,14 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "patch_pixels": (np.uint8, ("R", PATCH_PIXELS)),
     "patch_shift": (np.float32, ("R", 2)),
 }
+# The patches of a frame at a known place, which tracks P landmarks. Present only if there is one.
+KNOWN_PLACE_ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
+    "place_landmark": (np.int32, ("P",)),
+    "place_octave": (np.uint8, ("P",)),
+    "place_angle": (np.float32, ("P",)),
+    "place_pixels": (np.uint8, ("P", PATCH_PIXELS)),
+    "place_shift": (np.float32, ("P", 2)),
+}
 FEATURES = ("xy", "octave", "angle", "descriptors", "u_right")
 _TRACKER_FIELDS = ("index", "timestamp", "lost_frames", "n_tracked")
 _MOST = 1e12  # metres, pixels or seconds
@@ -45,8 +53,9 @@ _MAPPER_FIELDS = ("reference", "last_frame", "last_timestamp")
 
 
 def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
-    """Return the arrays of a checkpoint, under their names in ``ARRAYS``."""
+    """Return the arrays of a checkpoint, under their names in ``arrays_of``."""
     tracker, patches = checkpoint.tracker, checkpoint.mapper.patches
+    known_place = checkpoint.mapper.known_place
     no_pixels, no_shift = np.empty((0, PATCH_PIXELS), np.uint8), np.empty((0, 2), np.float32)
     return {
         **{name: getattr(tracker.features, name) for name in FEATURES},
@@ -55,21 +64,32 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
         "patch_keyframe": np.array([one.keyframe for one in patches], np.int64),
         "patch_pixels": np.concatenate([no_pixels, *(one.pixels for one in patches)]),
         "patch_shift": np.concatenate([no_shift, *(one.shift for one in patches)]),
+        **{
+            name: getattr(known_place, name.removeprefix("place_"))
+            for name in KNOWN_PLACE_ARRAYS
+            if known_place is not None
+        },
     }
+
+
+def arrays_of(entry: dict[str, Any]) -> dict[str, tuple[type, tuple[str | int, ...]]]:
+    """Return the type and shape of each array of a checkpoint with this JSON entry."""
+    return ARRAYS if entry["mapper"].get("known_place") is None else ARRAYS | KNOWN_PLACE_ARRAYS
 
 
 def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
     """Return the data of a checkpoint that are not arrays, as a JSON object. JSON preserves float64
     numbers exactly."""
     tracker, closing = checkpoint.tracker, checkpoint.closing
-    consistency = closing.consistency
+    consistency, known_place = closing.consistency, checkpoint.mapper.known_place
     return {
         "tracker": {name: getattr(tracker, name) for name in _TRACKER_FIELDS}
         | {
             "T_cw": tracker.T_cw.tolist(),
             "twist": None if tracker.twist is None else tracker.twist.tolist(),
         },
-        "mapper": {name: getattr(checkpoint.mapper, name) for name in _MAPPER_FIELDS},
+        "mapper": {name: getattr(checkpoint.mapper, name) for name in _MAPPER_FIELDS}
+        | {"known_place": None if known_place is None else known_place.frame},
         "policy": asdict(checkpoint.policy),
         "odometry": checkpoint.odometry,
         "rig": {"delay": checkpoint.rig.delay, "sides": checkpoint.rig.sides},
@@ -102,8 +122,9 @@ def checked_checkpoint(
         "Q": len(arrays["coarse"]),
         "M": len(arrays["patch_keyframe"]),
         "R": len(arrays["patch_shift"]),
+        "P": len(arrays.get("place_landmark", ())),
     }
-    for name, (dtype, shape) in ARRAYS.items():
+    for name, (dtype, shape) in arrays_of(entry).items():
         array = arrays[name]
         wanted = tuple(sizes[size] if isinstance(size, str) else size for size in shape)
         if array.dtype != dtype or array.shape != wanted or not array.flags.c_contiguous:
@@ -146,6 +167,7 @@ def checked_checkpoint(
             last_frame=last_frame,
             last_timestamp=-np.inf if last_timestamp == -np.inf else _number(last_timestamp),
             patches=_patches_of(arrays, map_.arrays.first_row[: map_.n_keyframes + 1]),
+            known_place=_known_place_of(arrays, mapper.get("known_place"), map_, n_frames),
         ),
         policy=PolicyState(
             _number(policy["gained_close"]),
@@ -199,6 +221,23 @@ def _patches_of(
         raise ValueError("the patches do not match their keyframes")
     parts = (np.split(arrays[name], last[:-1]) for name in ("patch_pixels", "patch_shift"))
     return tuple(map(KeyframePatches, keyframes.tolist(), *parts)) if len(last) else ()
+
+
+def _known_place_of(
+    arrays: dict[str, NDArray], frame: int | None, map_: Map, n_frames: int
+) -> FramePatches | None:
+    if frame is None:
+        return None
+    landmark = arrays["place_landmark"]
+    valid = (
+        _count(frame) < n_frames
+        and (np.diff(landmark) > 0).all()
+        and ((landmark >= 0) & (landmark < map_.n_landmarks)).all()
+        and (arrays["place_octave"] < len(map_.scales)).all()
+    )
+    if not valid:
+        raise ValueError("the patches of a known place are out of range")
+    return FramePatches(frame, *(arrays[name] for name in KNOWN_PLACE_ARRAYS))
 
 
 def _closing_of(entry: dict[str, Any], n_keyframes: int) -> ClosingState:

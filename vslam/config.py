@@ -180,8 +180,8 @@ class AlignmentConfig(Section):
     """Ratio of the variance of a keypoint's position to the variance of an aligned match. A larger
     ratio gives aligned matches more weight. [own]"""
     keyframes: int = Field(5, ge=1)
-    """Patches are kept for this many of the newest keyframes. Landmarks that only older keyframes
-    observe are not aligned. [own]"""
+    """Patches are kept for this many of the newest keyframes. Except at a known place, landmarks
+    that only older keyframes observe are not aligned. [own]"""
 
 
 class TrackingConfig(Section):

@@ -82,10 +82,11 @@ def patches_of_frame(frame: Frame, scales: NDArray[np.float64]) -> FramePatches 
     if frame.pyramid is None:
         return None
     tracked = np.flatnonzero(frame.landmark >= 0)
-    tracked = tracked[np.argsort(frame.landmark[tracked])]
+    landmark, first = np.unique(frame.landmark[tracked], return_index=True)
+    tracked = tracked[first]
     return FramePatches(
         frame.index,
-        frame.landmark[tracked],
+        landmark,
         frame.features.octave[tracked],
         frame.features.angle[tracked],
         *_patches_of(frame, tracked, scales),

@@ -156,7 +156,7 @@ def main() -> None:
         folder = Path(name)
         link(data, options.seq, places, folder)
         command = [sys.executable, "-m", "vslam", "run", "--data", name, "--seq", "laps"]
-        command += ["--perturb", options.perturb, "--seed", str(options.seed), "--compare", "none"]
+        command += ["--perturb", options.perturb, "--seed", str(options.seed)]
         command += ["--no-report", "--no-record", "--quiet", "--out", str(folder / "runs")]
         subprocess.run(command, check=True)
         run = folder / "runs" / "latest"

@@ -131,7 +131,7 @@ class MapBuilding(Mode):
         if not self._is_keyframe(frame, evidence):
             return False
         self._mapper.settle()
-        if not self._match_features(frame) or self._uses_existing_keyframe(frame):
+        if not self._match_features(frame) or self._use_existing_keyframe(frame):
             return False
         self._mapper.insert(frame)
         self.policy.reference_renewed()
@@ -142,8 +142,12 @@ class MapBuilding(Mode):
             return self.policy.wants_keyframe(evidence)
         return self.policy.is_due(frame.index, evidence)
 
-    def _uses_existing_keyframe(self, frame: PlacedFrame) -> bool:
-        """If the place is known, make an existing keyframe the reference keyframe."""
+    def _use_existing_keyframe(self, frame: PlacedFrame) -> bool:
+        """If the place is known, make an existing keyframe the reference keyframe.
+
+        Returns:
+            Whether the place is known.
+        """
         place = self._mapper.find_old_place(frame)
         n_inliers = int(np.count_nonzero(frame.landmark >= 0))
         if place is None or not self.policy.is_known(

@@ -159,6 +159,19 @@ def test_a_table_of_another_version_is_listed_and_marked_on_its_page(figures, ma
     assert len(figures.check(made).older) == 1
 
 
+def test_a_table_is_kept_by_a_version_that_gives_the_same_trajectories(figures, made):
+    stamps = figures.read_stamps(made)
+    drives, entry = "docs/research/drives.csv", figures.read_entries(made)[0]
+    assert entry.files == (drives,)
+    before = replace(stamps[drives], method=figures.METHOD_VERSION - 1)
+    assert figures.is_older(before, entry)
+    same = (figures.METHOD_VERSION - 1, figures.METHOD_VERSION)
+    assert not figures.is_older(before, replace(entry, same_in=same))
+    # A later version must be compared with them anew.
+    past = tuple(version - 1 for version in same)
+    assert figures.is_older(before, replace(entry, same_in=past))
+
+
 @pytest.mark.parametrize(
     ("change", "fault"),
     [

@@ -56,6 +56,8 @@ class Entry:
         reads: files of other entries that the commands read.
         seed: seed of the random numbers.
         trajectories: whether the files depend on the version of the SLAM method.
+        same_in: versions of the method in which the trajectories of these runs are the same. A file
+            that one of them made is up to date in the others.
         tested: name of the test that compares the files with the code. Such files need no stamp.
         history: how the files of a finished experiment were made, if there is no command for them.
     """
@@ -67,6 +69,7 @@ class Entry:
     reads: tuple[str, ...] = ()
     seed: int | None = None
     trajectories: bool = True
+    same_in: tuple[int, ...] = ()
     tested: str = ""
     history: str = ""
 
@@ -132,8 +135,9 @@ def digest_of(path: Path) -> str:
 
 
 def is_older(stamp: Stamp, entry: Entry) -> bool:
-    """Return whether a file depends on the method and was made by a different version of it."""
-    return entry.trajectories and stamp.method != METHOD_VERSION
+    """Return whether a file depends on the method and was made by a version that is out of date."""
+    equivalent = entry.same_in if METHOD_VERSION in entry.same_in else (METHOD_VERSION,)
+    return entry.trajectories and stamp.method not in equivalent
 
 
 def make(root: Path, *, quick: bool, only: str = "") -> int:

@@ -221,6 +221,24 @@ def test_a_page_that_differs_from_its_source_is_found(figures, made, shown, inst
     assert fault in found
 
 
+def test_new_numbers_are_written_into_the_tables_of_a_page(figures, made):
+    table = made / "docs/research/drives.csv"
+    table.write_text(table.read_text().replace("0.1234", "0.5678").replace("1234.5", "98765.4"))
+    filled = figures.sources.fill(PAGE, made)
+    assert "| `a` | **0.57 m** | 12, 2.5 |\n| b | 98,765.4 m | 7, none |\n" in filled
+    # The numbers in sentences must be corrected by hand.
+    (fault,) = figures.sources.compare(filled, made)
+    assert "does not mention 49382.9" in fault
+
+
+def test_pages_are_updated_when_their_tables_are_made(figures, made, capsys):
+    page = made / "README.md"
+    page.write_text(PAGE.replace("**0.12 m**", "**0.99 m**"))
+    assert figures.make(made, quick=False) == 0
+    assert "README.md: numbers updated." in capsys.readouterr().out
+    assert page.read_text() == PAGE
+
+
 def test_a_table_may_join_the_rows_of_several_files(figures, made):
     drives = made / "docs/research/drives.csv"
     head, *rows = drives.read_text().splitlines(keepends=True)

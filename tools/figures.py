@@ -9,10 +9,11 @@ writes the files into the folder ``$OUT``. The folder ``$TOWNS`` contains render
 version of the method has its own folder ``$OUT`` in ``runs/figures``. This folder is kept, so that
 an interrupted command can be resumed.
 
-The files are then copied to their places in the repository, or with ``--quick`` to
-``build/figures``. For each file, a stamp is written to ``docs/stamps.json`` there. A stamp contains
-the commit, the version of the method, the machine, the seed, the command and the digest of the
-file. A file with a valid stamp of the current version of the method is not made again.
+The files are then copied to their places in the repository, and their numbers are written into the
+tables of the pages. With ``--quick``, the files are copied to ``build/figures`` instead. For each
+file, a stamp is written to ``docs/stamps.json`` there. A stamp contains the commit, the version of
+the method, the machine, the seed, the command and the digest of the file. A file with a valid stamp
+of the current version of the method is not made again.
 
 sources.py explains how a page names the file from which its numbers are taken.
 """
@@ -170,7 +171,22 @@ def make(root: Path, *, quick: bool, only: str = "") -> int:
             failed += not succeeded
             what = "made in" if succeeded else "FAILED after"
             print(f"{name}: {what} {time.monotonic() - start:.0f} s.", flush=True)
+    if not quick:
+        fill_pages(root)
     return failed
+
+
+def fill_pages(root: Path) -> None:
+    """Write the numbers of the files into the tables of the pages."""
+    for page in pages(root):
+        text = page.read_text()
+        try:
+            filled = sources.fill(text, root)
+        except (LookupError, ValueError, OSError):
+            continue  # the check names the source that cannot be read
+        if filled != text:
+            page.write_text(filled)
+            print(f"{page.relative_to(root)}: numbers updated.", flush=True)
 
 
 def _is_done(entry: Entry, target: Path, command: str) -> bool:

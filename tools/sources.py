@@ -26,6 +26,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from statistics import mean, median
@@ -59,44 +60,111 @@ def untraced(text: str) -> tuple[int, int]:
 def compare(text: str, root: Path) -> Iterator[str]:
     """Compare a page with its sources. Yield a sentence for each value that differs."""
     for found in COMMENT.finditer(text):
-        lines, after = lines_of(found[1]), text[found.end() :].partition("\n\n")[0]
+        lines, after = lines_of(found[1]), _block_after(found, text)
         try:
-            if not after.lstrip().startswith("|"):
+            if after.lstrip().startswith("|"):
+                for cell in _traced_cells(lines, after, root):
+                    yield from cell.faults()
+            else:
                 for line in lines:
                     yield from _paragraph_faults(line, after, root)
-                continue
-            head, _, *rows = [_cells(row) for row in after.splitlines()]
-            if len(lines) > len(rows):
-                yield f"{len(lines)} source lines for the {len(rows)} rows after {rows[0]}"
-            for line, row in zip_longest(lines[: len(rows)], rows, fillvalue=lines[-1]):
-                yield from _row_faults(line, head, row, root)
         except (LookupError, ValueError, OSError) as error:
             yield f"source {lines[0]!r} cannot be read: {error}"
 
 
-def _cells(row: str) -> list[str]:
-    return [cell.strip() for cell in row.strip().strip("|").split("|")]
+def fill(text: str, root: Path) -> str:
+    """Write the numbers of the sources into the tables of a page, and return the new page.
+
+    Each number keeps its decimals. Cells that contain text from the source are left unchanged, and
+    so are cells with too many or too few numbers, and paragraphs.
+
+    Raises:
+        LookupError, ValueError, OSError: a source cannot be read.
+    """
+    for found in reversed([*COMMENT.finditer(text)]):
+        table = filled = _block_after(found, text)
+        if not table.lstrip().startswith("|"):
+            continue
+        for cell in reversed([*_traced_cells(lines_of(found[1]), table, root)]):
+            filled = filled[: cell.start] + cell.filled() + filled[cell.start + len(cell.text) :]
+        text = text[: found.end()] + filled + text[found.end() + len(table) :]
+    return text
 
 
-def _row_faults(line: str, head: list[str], row: list[str], root: Path) -> Iterator[str]:
-    if line == "-":
-        return
-    file, filters, *columns = [part.strip() for part in line.split("|")]
-    columns += columns[-1:] * (len(row) - len(columns))
-    for name, cell, column in zip(head, row, columns, strict=True):
-        values = _values(root, file, filters, column, [name, *row]) if column else []
-        left, numbers = cell, []
-        for value in values:
+def _block_after(found: re.Match[str], text: str) -> str:
+    """Return the table or paragraph that follows a comment."""
+    return text[found.end() :].partition("\n\n")[0]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table, and the values of its source.
+
+    Attributes:
+        start: position of the text of the cell, counted from the beginning of the table.
+        text: text of the cell.
+        row: text of the first cell of the row.
+        source: file and columns.
+        values: values that the cell must show.
+    """
+
+    start: int
+    text: str
+    row: str
+    source: str
+    values: list[float | str]
+
+    def faults(self) -> Iterator[str]:
+        """Yield a sentence for each value that the cell does not show."""
+        left = self.text
+        for value in self.values:
             if isinstance(value, str):
                 if value not in left:
-                    yield f"{row[0]}: {cell!r} does not show {value!r} of {file} ({column})"
+                    yield f"{self.row}: {self.text!r} does not show {value!r} of {self.source}"
                 left = left.replace(value, "", 1)
-            else:
-                numbers.append(value)
-        shown = NUMBER.findall(left)
-        agree = len(shown) == len(numbers) and all(map(_is_rounded, shown, numbers))
-        if column and not agree:
-            yield f"{row[0]}: {cell!r} differs from {values} of {file} ({column})"
+        numbers, shown = self._numbers(), NUMBER.findall(left)
+        if not (len(shown) == len(numbers) and all(map(_is_rounded, shown, numbers))):
+            yield f"{self.row}: {self.text!r} differs from {self.values} of {self.source}"
+
+    def filled(self) -> str:
+        """Return the text with the numbers of the source, or the same text if they do not fit."""
+        numbers, shown = self._numbers(), NUMBER.findall(self.text)
+        if len(numbers) != len(self.values) or len(shown) != len(numbers):
+            return self.text
+        pairs = zip(shown, numbers, strict=True)
+        rounded = iter(
+            [one if _is_rounded(one, value) else _like(one, value) for one, value in pairs]
+        )
+        return NUMBER.sub(lambda _: next(rounded), self.text)
+
+    def _numbers(self) -> list[float]:
+        return [value for value in self.values if not isinstance(value, str)]
+
+
+def _traced_cells(lines: list[str], table: str, root: Path) -> Iterator[Cell]:
+    """Yield the cells of a table that have a source."""
+    head, _, *rows = table.splitlines()
+    names = _cells(head)
+    if len(lines) > len(rows):
+        raise ValueError(f"it has {len(lines)} lines, and the table has {len(rows)} rows")
+    start = table.index(rows[0])
+    for line, row in zip_longest(lines, rows, fillvalue=lines[-1]):
+        texts, position = _cells(row), start
+        start += len(row) + 1
+        if line == "-":
+            continue
+        file, filters, *columns = [part.strip() for part in line.split("|")]
+        columns += columns[-1:] * (len(texts) - len(columns))
+        for name, text, column in zip(names, texts, columns, strict=True):
+            position = table.index("|", position) + 1
+            if column:
+                values = _values(root, file, filters, column, [name, *texts])
+                at = table.index(text, position)
+                yield Cell(at, text, texts[0], f"{file} ({column})", values)
+
+
+def _cells(row: str) -> list[str]:
+    return [cell.strip() for cell in row.strip().strip("|").split("|")]
 
 
 def _paragraph_faults(line: str, paragraph: str, root: Path) -> Iterator[str]:
@@ -109,6 +177,12 @@ def _paragraph_faults(line: str, paragraph: str, root: Path) -> Iterator[str]:
             found = any(_is_rounded(number, value) for number in shown)
         if not found:
             yield f"{paragraph[:40]!r}... does not mention {value} of {file} ({column})"
+
+
+def _like(shown: str, value: float) -> str:
+    """Format a value with the decimals of another number."""
+    decimals = len(shown.partition(".")[2])
+    return f"{value:,.{decimals}f}" if abs(value) >= 1000 else f"{value:.{decimals}f}"
 
 
 def _is_rounded(shown: str, value: float) -> bool:

@@ -7,7 +7,7 @@ The script prints for each run the frame at which it was killed, the number of s
 seconds of work that were lost, and the ATE of the whole run. It also tells whether the trajectory
 is byte-identical to the trajectory of an undisturbed run.
 
-    python tools/kill_test.py --kills 10 --autosave 4 -- --dataset synthetic --seq demo
+    python tools/kill_test.py --kills 10 --autosave 1 -- --dataset synthetic --seq demo
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def main() -> None:
             at = random_.randrange(1, frames - 1)
             folder, done, seconds = kill_at(words, out / str(number), at, saving)
             if (folder / "report.json").exists():
-                print(f"{number}\tthe run ended before it could be killed", flush=True)
+                print(f"run {number} ended before it could be killed", flush=True)
                 continue
             try:
                 saved, wall_s = saved_frames(folder)

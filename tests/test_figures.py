@@ -223,9 +223,10 @@ def test_a_page_that_differs_from_its_source_is_found(figures, made, shown, inst
 
 def test_new_numbers_are_written_into_the_tables_of_a_page(figures, made):
     table = made / "docs/research/drives.csv"
-    table.write_text(table.read_text().replace("0.1234", "0.5678").replace("1234.5", "98765.4"))
+    rows = table.read_text().replace("0.1234", "0.5678").replace("1234.5", "98765.4")
+    table.write_text(rows.replace("2.5,12", "2.5,13"))
     filled = figures.sources.fill(PAGE, made)
-    assert "| `a` | **0.57 m** | 12, 2.5 |\n| b | 98,765.4 m | 7, none |\n" in filled
+    assert "| `a` | **0.57 m** | 13, 2.5 |\n| b | 98,765.4 m | 7, none |\n" in filled
     # The numbers in sentences must be corrected by hand.
     (fault,) = figures.sources.compare(filled, made)
     assert "does not mention 49382.9" in fault

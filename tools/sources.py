@@ -34,7 +34,7 @@ from statistics import mean, median
 COMMENT = re.compile(r"<!-- from:(.*?)-->[ ]*\n", re.DOTALL)
 TABLE = re.compile(r"(--> *\n)?(?:^ *\|.*\n)+?^ *\|[-| :]+\|\n((?:^ *\|.*\n?)+)", re.MULTILINE)
 DECIMAL = re.compile(r"\d\.\d")
-NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?")
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:,\d{3})*(?:\.\d+)?")
 OVER_ROWS = {"mean": mean, "median": median, "sum": sum}
 
 

@@ -213,6 +213,7 @@ def test_a_table_without_a_stamp_or_a_command_is_a_fault(figures, made):
         ),
         ("drives.csv | drive=$1", "none.csv | drive=$1", "cannot be read"),
         ("ate_m (system=ours)", "ate (system=ours)", "cannot be read: 'ate'"),
+        ("theirs)\n-->", "theirs)\n-\n-\n-->", "it has 3 lines, and the table has 2 rows"),
     ],
 )
 def test_a_page_that_differs_from_its_source_is_found(figures, made, shown, instead, fault):

@@ -128,27 +128,26 @@ class Cell:
 
     def filled(self) -> str:
         """Return the text with the numbers of the source, or the same text if they do not fit."""
-        numbers, shown = self._numbers(), NUMBER.findall(self.text)
-        if len(numbers) != len(self.values) or len(shown) != len(numbers):
+        numbers = self._numbers()
+        if not len(NUMBER.findall(self.text)) == len(numbers) == len(self.values):
             return self.text
-        pairs = zip(shown, numbers, strict=True)
-        rounded = iter(
-            [one if _is_rounded(one, value) else _like(one, value) for one, value in pairs]
-        )
-        return NUMBER.sub(lambda _: next(rounded), self.text)
+        values = iter(numbers)
+        return NUMBER.sub(lambda shown: _updated(shown[0], next(values)), self.text)
 
     def _numbers(self) -> list[float]:
         return [value for value in self.values if not isinstance(value, str)]
 
 
 def _traced_cells(lines: list[str], table: str, root: Path) -> Iterator[Cell]:
-    """Yield the cells of a table that have a source."""
+    """Yield the cells of a table that have a source.
+
+    Raises:
+        ValueError: after all cells, if there are more source lines than rows.
+    """
     head, _, *rows = table.splitlines()
     names = _cells(head)
-    if len(lines) > len(rows):
-        raise ValueError(f"it has {len(lines)} lines, and the table has {len(rows)} rows")
     start = table.index(rows[0])
-    for line, row in zip_longest(lines, rows, fillvalue=lines[-1]):
+    for line, row in zip_longest(lines[: len(rows)], rows, fillvalue=lines[-1]):
         texts, position = _cells(row), start
         start += len(row) + 1
         if line == "-":
@@ -161,6 +160,8 @@ def _traced_cells(lines: list[str], table: str, root: Path) -> Iterator[Cell]:
                 values = _values(root, file, filters, column, [name, *texts])
                 at = table.index(text, position)
                 yield Cell(at, text, texts[0], f"{file} ({column})", values)
+    if len(lines) > len(rows):
+        raise ValueError(f"it has {len(lines)} lines, and the table has {len(rows)} rows")
 
 
 def _cells(row: str) -> list[str]:
@@ -179,8 +180,10 @@ def _paragraph_faults(line: str, paragraph: str, root: Path) -> Iterator[str]:
             yield f"{paragraph[:40]!r}... does not mention {value} of {file} ({column})"
 
 
-def _like(shown: str, value: float) -> str:
-    """Format a value with the decimals of another number."""
+def _updated(shown: str, value: float) -> str:
+    """Return a value with the decimals of the number that is shown, or this number if it agrees."""
+    if _is_rounded(shown, value):
+        return shown
     decimals = len(shown.partition(".")[2])
     return f"{value:,.{decimals}f}" if abs(value) >= 1000 else f"{value:.{decimals}f}"
 

@@ -256,6 +256,18 @@ def test_a_table_may_join_the_rows_of_several_files(figures, made):
     }
 
 
+def test_a_cell_may_list_the_values_of_several_rows(figures, made):
+    page = """<!-- from: docs/research/drives.csv | drive=$1 | | each ate_m -->
+| drive | ATE of each system |
+|---|---|
+| a | 0.12, 2.6 |
+| b | 1,234.5, nothing |
+"""
+    (fault,) = figures.sources.compare(page, made)
+    assert "'0.12, 2.6' differs from [0.1234, 2.5]" in fault
+    assert "| a | 0.12, 2.5 |\n| b | 1,234.5, nothing |\n" in figures.sources.fill(page, made)
+
+
 def test_a_table_made_by_other_means_is_stamped_with_its_version(figures, made):
     table = made / "docs/research/drives.csv"
     table.write_text(table.read_text().replace("2.5,12", "2.54,12"))

@@ -251,14 +251,11 @@ RULES = {
         (("python tools/experiments/light/day_night.py synthetic", AGAIN),),
     ),
     "docs/research/stress.md": Rules(
-        (
-            ("--laws all", "--laws night --seeds 1 --steps 1"),
-            (r" (docs/research/stress/\w+.csv)", r" tools/../\1"),  # tools is a link
-        ),
+        (("--laws all --detectors bow --steps 4", "--laws night --seeds 1 --steps 1"),),
         (
             ("vslam stress --dataset synthetic --seqs demo --laws", HOURS),
             (
-                'vslam stress --data "$KITTI_ROOT" --seqs 00 --max-frames 216 --laws all --seeds 1 '
+                'vslam stress --data "$KITTI_ROOT" --seqs 00 --max-frames 216 --laws all '
                 "--steps 4 --systems orbslam3",
                 ORBSLAM,
             ),

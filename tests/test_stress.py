@@ -591,13 +591,29 @@ def test_stress_refuses_before_it_starts(tmp_path, words, said):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_table_of_boundaries_is_that_of_the_csv(monkeypatch):
-    root = Path(__file__).parents[1]
-    monkeypatch.syspath_prepend(str(root / "tools" / "experiments" / "stress"))
-    import boundary_table
+def test_boundaries_of_two_systems_are_compared_by_their_medians(tmp_path, monkeypatch):
+    tools = Path(__file__).parents[1] / "tools" / "experiments" / "stress"
+    monkeypatch.syspath_prepend(str(tools))
+    import compare_boundaries
 
-    docs = root / "docs" / "research"
-    tables = [docs / "stress" / f"{name}.csv" for name in ("kitti00", "kitti00_orbslam3")]
-    made = boundary_table.table(tables, "bow", "orbslam3")
-    page = (docs / "stress.md").read_text()
-    assert made in page, "run: python tools/experiments/stress/boundary_table.py"
+    # The visibility in fog is smaller if the fog is denser. An empty strength is the weakest one.
+    held = {
+        ("gamma", "bow"): ["10", "2", "5"], ("gamma", "orbslam3"): ["9", "4", "4"],
+        ("fog", "bow"): ["60"], ("fog", "orbslam3"): ["20"],
+        ("black_left", "bow"): ["10"], ("black_left", "orbslam3"): [""],
+        ("blur", "bow"): ["3"], ("blur", "orbslam3"): ["3"],
+        ("noise", "bow"): ["3"],
+    }  # fmt: skip
+    rows = [
+        f"00,{law},{system},{seed},{strength}\n"
+        for (law, system), strengths in held.items()
+        for seed, strength in enumerate(strengths)
+    ]
+    (tmp_path / "in.csv").write_text("sequence,law,system,seed,holds_to\n" + "".join(rows))
+    medians = compare_boundaries.read_medians([tmp_path / "in.csv"])
+    (row,) = compare_boundaries.compare(medians, "bow", "orbslam3")
+    assert row["laws_first_more"] == "gamma black_left"
+    assert row["laws_second_more"] == "fog"
+    assert row["laws_equal"] == "blur"
+    assert (row["first_more"], row["second_more"], row["equal"]) == (2, 1, 1)
+    assert compare_boundaries.compare(medians, "both", "orbslam3") == []

@@ -15,7 +15,8 @@ The fields of a line, separated by ``|``, are:
   must show the values of these columns, rounded as in the cell. The last field also applies to all
   further cells. If a field is empty, its cell is not compared. A filter in parentheses applies to
   the columns that precede it in the field. ``mean x``, ``median x`` and ``sum x`` stand for the
-  mean, median and sum of column x over all selected rows.
+  mean, median and sum of column x over all selected rows. ``each x`` stands for all values of
+  column x in these rows, in the order of the file. Empty values are left out.
 
 A line that contains only ``-`` skips a row. A comment may also stand before a paragraph. Such a
 comment names columns whose values the paragraph must mention.
@@ -211,13 +212,19 @@ def _values(root: Path, files: str, filters: str, column: str, row: list[str]) -
         wanted = _wanted(f"{filters}, {in_parentheses}", row)
         rows = [one for one in table if wanted.items() <= one.items()]
         over, _, summed = name.partition(" ")
-        if over in OVER_ROWS and rows:
+        if over == "each":
+            found += [_parsed(one[summed]) for one in reversed(rows) if one.get(summed)]
+        elif over in OVER_ROWS and rows:
             found.append(OVER_ROWS[over]([float(one[summed]) for one in rows]))
         elif len(rows) != 1:
             raise LookupError(f"{len(rows)} rows of {files} have {wanted}")
         elif value := rows[0][name]:
-            found.append(float(value) if NUMBER.fullmatch(value) else value)
+            found.append(_parsed(value))
     return found[::-1]
+
+
+def _parsed(value: str) -> float | str:
+    return float(value) if NUMBER.fullmatch(value) else value
 
 
 def _wanted(filters: str, row: list[str]) -> dict[str, str]:

@@ -1,0 +1,93 @@
+"""Compare the strengths of perturbations that two systems withstand, from ``vslam stress``.
+
+python tools/experiments/stress/compare_boundaries.py boundaries.csv ... \\
+    --pair bow orbslam3 --pair both orbslam3 --out compared.csv
+
+For each law, the medians over the seeds are compared. The table has a row for each pair of systems
+and each sequence. It contains the laws under which the first system withstands more, those under
+which the second system withstands more, and those under which there is no difference.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections import defaultdict
+from pathlib import Path
+from statistics import median
+
+from vslam.datasets.perturbation import LAWS
+
+Medians = dict[tuple[str, str], dict[str, float]]  # (sequence, system) -> law -> severity
+
+
+def severity(law: str, strength: str) -> float:
+    """Return a number that grows with the severity of a perturbation.
+
+    ``strength`` is empty if the system failed at all tested strengths. The number is then smaller
+    than that of every strength.
+    """
+    if not strength:
+        return float("-inf")
+    kind = LAWS[law]
+    return float(strength) if kind.strongest > kind.weakest else -float(strength)
+
+
+def read_medians(paths: list[Path]) -> Medians:
+    """Read tables of ``vslam stress``, and return the median severity that was withstood."""
+    found: dict[tuple[str, str, str], list[float]] = defaultdict(list)
+    for path in paths:
+        with path.open(newline="") as file:
+            for row in csv.DictReader(file):
+                key = row["sequence"], row["system"], row["law"]
+                found[key].append(severity(row["law"], row["holds_to"]))
+    medians: Medians = defaultdict(dict)
+    for (sequence, system, law), values in found.items():
+        medians[sequence, system][law] = median(values)
+    return medians
+
+
+def compare(medians: Medians, first: str, second: str) -> list[dict[str, object]]:
+    """Return a row for each sequence on which both systems were tested."""
+    rows: list[dict[str, object]] = []
+    for sequence in dict.fromkeys(sequence for sequence, _ in medians):
+        one, other = (medians.get((sequence, system), {}) for system in (first, second))
+        common = [law for law in LAWS if law in one and law in other]
+        if not common:
+            continue
+        more = [law for law in common if one[law] > other[law]]
+        less = [law for law in common if one[law] < other[law]]
+        same = [law for law in common if one[law] == other[law]]
+        rows.append(
+            {
+                "sequence": sequence,
+                "first": first,
+                "second": second,
+                "laws": len(common),
+                "first_more": len(more),
+                "second_more": len(less),
+                "equal": len(same),
+                "laws_first_more": " ".join(more),
+                "laws_second_more": " ".join(less),
+                "laws_equal": " ".join(same),
+            }
+        )
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("csv", type=Path, nargs="+", help="files boundaries.csv")
+    parser.add_argument("--pair", nargs=2, action="append", required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
+    medians = read_medians(args.csv)
+    rows = [row for pair in args.pair for row in compare(medians, *pair)]
+    with args.out.open("w", newline="") as file:
+        table = csv.DictWriter(file, rows[0], lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -174,7 +174,7 @@ def measure(command: list[str], folder: Path) -> Process:
 def sample_memory(
     pid: int, ended: threading.Event, start: float, held: list[tuple[float, float]]
 ) -> None:
-    while not ended.wait(0.5):
+    while not ended.wait(0.1):
         with suppress(OSError):
             status = Path(f"/proc/{pid}/status").read_text()
             kilobytes = [line.split()[1] for line in status.splitlines() if "VmRSS" in line]

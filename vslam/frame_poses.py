@@ -103,15 +103,6 @@ class FramePoses:
     def __len__(self) -> int:
         return self._n
 
-    @property
-    def unit(self) -> float:
-        """Factor by which loop closures have scaled lengths near the reference keyframe.
-
-        It is 1 while there is no keyframe.
-        """
-        keyframes = self._keyframes
-        return keyframes.unit_scale(keyframes.reference) if keyframes.n_keyframes else 1.0
-
     def timestamp(self, index: int) -> float:
         """Return the timestamp of a frame in seconds. Index -1 is the last frame."""
         return float(self._frames.timestamp[self._number(index)])

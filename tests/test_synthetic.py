@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import csv
+import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -37,6 +40,7 @@ from vslam.datasets.synthetic.solids import turn
 from vslam.datasets.synthetic.town import build_town
 from vslam.errors import InputError
 from vslam.lab.loopbench.drives import render_views
+from vslam.machine import has_avx2
 
 CAMERA = Camera(360.0, 360.0, 300.3, 95.7, 0.54, 620, 190)
 BY_DAY = Light(np.array([0.0, -0.8, -0.6]), visibility=1e9, haze=0.0)
@@ -655,3 +659,21 @@ def test_moves_beyond_the_road_are_refused_before_rendering(tmp_path, pairs, opt
     words = ["synth", "demo", *pairs, option, "--out", str(tmp_path / "out")]
     assert why in str(CliRunner().invoke(app, words).exception)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(not has_avx2(), reason="the kernels for AVX2 need a CPU with AVX2")
+def test_a_route_is_the_same_on_cpus_with_and_without_avx512():
+    """On a CPU with AVX-512, OpenBLAS would use kernels that round differently."""
+    code = (
+        "from vslam.machine import set_up_openblas; set_up_openblas();"
+        "from vslam.datasets.synthetic.routes import built_in_route;"
+        "print(built_in_route('01').T_wc.tobytes().hex())"
+    )
+    given = {key: os.environ[key] for key in os.environ if key != "OPENBLAS_CORETYPE"}
+    poses = [
+        subprocess.run(
+            [sys.executable, "-c", code], env=env, check=True, capture_output=True
+        ).stdout
+        for env in (given, given | {"OPENBLAS_CORETYPE": "Haswell"})
+    ]
+    assert poses[0] == poses[1]

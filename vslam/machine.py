@@ -110,6 +110,29 @@ def give_back_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
+def set_up_openblas() -> None:
+    """Set up OpenBLAS, which computes NumPy's matrix products. NumPy must not be imported yet.
+
+    OpenBLAS gets one thread. Idle threads burn CPU time, and no matrix of a run is large enough to
+    profit from several threads.
+
+    OpenBLAS also gets the kernels for AVX2 on every CPU that has AVX2. By default, it uses other
+    kernels on CPUs with AVX-512. They round differently, so a few pixels of rendered images differ.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if has_avx2():
+        os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
+
+
+def has_avx2() -> bool:
+    """Return whether the processor is known to have AVX2 and FMA (Linux only)."""
+    with suppress(OSError), open("/proc/cpuinfo") as lines:
+        for line in lines:
+            if line.startswith("flags"):
+                return {"avx2", "fma"} <= set(line.split())
+    return False
+
+
 def cpu_name() -> str:
     """Return the model name of the processor."""
     # platform.processor() is empty or just "x86_64" on Linux.

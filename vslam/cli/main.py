@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import gc
-import os
 import re
 import signal
 import sys
@@ -35,7 +34,7 @@ from vslam.cli import (
 )
 from vslam.cli import map as map_
 from vslam.errors import InputError, ResultsError, did_you_mean, plain_reason
-from vslam.machine import keep_memory
+from vslam.machine import keep_memory, set_up_openblas
 from vslam.plugins import reason
 from vslam.untrusted import require_utf8
 
@@ -133,9 +132,7 @@ def main() -> None:
     gc.set_threshold(200_000, 20, 100)
     atexit.register(gc.freeze)
     keep_memory()
-    # Idle OpenBLAS threads burn CPU time, and no matrix of a run is large enough to profit from
-    # several threads.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    set_up_openblas()
     signal.signal(signal.SIGTERM, _treat_as_ctrl_c)
     try:
         for word in sys.argv[1:]:

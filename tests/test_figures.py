@@ -266,6 +266,9 @@ def test_a_cell_may_list_the_values_of_several_rows(figures, made):
     (fault,) = figures.sources.compare(page, made)
     assert "'0.12, 2.6' differs from [0.1234, 2.5]" in fault
     assert "| a | 0.12, 2.5 |\n| b | 1,234.5, nothing |\n" in figures.sources.fill(page, made)
+    page = page.replace("2.6", "2.5").replace("| b | 1,234.5,", "| c |")
+    (fault,) = figures.sources.compare(page, made)
+    assert "0 rows of docs/research/drives.csv" in fault
 
 
 def test_a_table_made_by_other_means_is_stamped_with_its_version(figures, made):

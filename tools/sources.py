@@ -211,11 +211,11 @@ def _values(root: Path, files: str, filters: str, column: str, row: list[str]) -
         in_parentheses = more or in_parentheses
         wanted = _wanted(f"{filters}, {in_parentheses}", row)
         rows = [one for one in table if wanted.items() <= one.items()]
-        over, _, summed = name.partition(" ")
-        if over == "each":
-            found += [_parsed(one[summed]) for one in reversed(rows) if one.get(summed)]
+        over, _, operand = name.partition(" ")
+        if over == "each" and rows:
+            found += [_parsed(one[operand]) for one in reversed(rows) if one.get(operand)]
         elif over in OVER_ROWS and rows:
-            found.append(OVER_ROWS[over]([float(one[summed]) for one in rows]))
+            found.append(OVER_ROWS[over]([float(one[operand]) for one in rows]))
         elif len(rows) != 1:
             raise LookupError(f"{len(rows)} rows of {files} have {wanted}")
         elif value := rows[0][name]:

@@ -126,24 +126,22 @@ def set_up_openblas() -> None:
 
 def has_avx2() -> bool:
     """Return whether the processor is known to have AVX2 and FMA (Linux only)."""
-    with suppress(OSError), open("/proc/cpuinfo") as lines:
-        for line in lines:
-            if line.startswith("flags"):
-                return {"avx2", "fma"} <= set(line.split())
-    return False
+    return {"avx2", "fma"} <= set(_cpu_property("flags").split())
 
 
 def cpu_name() -> str:
     """Return the model name of the processor."""
     # platform.processor() is empty or just "x86_64" on Linux.
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    for line in lines:
-        if line.startswith("model name"):
-            return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    return _cpu_property("model name") or platform.processor() or platform.machine()
+
+
+def _cpu_property(name: str) -> str:
+    """Return a property of the first processor; empty if the system does not state it."""
+    with suppress(OSError), open("/proc/cpuinfo") as lines:
+        for line in lines:
+            if line.startswith(name):
+                return line.partition(":")[2].strip()
+    return ""
 
 
 @dataclass

@@ -176,6 +176,9 @@ RULES = {
             ("python tools/experiments/gps", "test_gps.py runs it"),
         )
     ),
+    "docs/research/scale.md": Rules(
+        not_run=(("python tools/experiments/scale/growth.py", "test_scale.py runs it"),)
+    ),
     "docs/research/uncertainty.md": Rules(
         not_run=(
             ("vslam synth", "test_synthetic.py renders drives"),

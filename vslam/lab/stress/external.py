@@ -23,6 +23,7 @@ import shlex
 import subprocess
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -128,34 +129,41 @@ def export_kitti(
         The indices of the written frames, and the error message of each frame with an unreadable
         image by the index of the frame.
     """
-    import cv2
-
     times: list[float] = []
     kept: list[int] = []
     unreadable: dict[int, str] = {}
-    second = {"stereo": "image_1", "rgbd": "depth"}.get(sequence.camera.sensor)
-    for name in filter(None, ("image_0", second)):
+    names = {"stereo": ["image_0", "image_1"], "rgbd": ["image_0", "depth"]}.get(
+        sequence.camera.sensor, ["image_0"]
+    )
+    for name in names:
         (folder / name).mkdir(parents=True)
-    frames = perturbed(sequence.frames(), perturbation.bound_to(sequence))
-    for index, frame in enumerate(frames):
-        try:
-            images = frame.read(map)
-        except DroppedFrameError:
-            continue
-        except UnreadableImageError as error:
-            unreadable[index] = str(error)
-            continue
-        for place, image in zip(("image_0", second), images, strict=True):
-            if place and image is not None:
-                path = folder / place / f"{len(kept):06d}.png"
-                pixels = image if image.dtype == np.uint8 else _millimetres(image)
-                if not cv2.imwrite(str(path), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-                    raise ResultsError(f"{path}: cannot be written; is the disk full?")
-        kept.append(index)
-        times.append(frame.timestamp - float(sequence.timestamps[0]))
+    with ThreadPoolExecutor(len(names)) as pool:
+        for index, frame in enumerate(
+            perturbed(sequence.frames(), perturbation.bound_to(sequence))
+        ):
+            try:
+                images = frame.read(pool.map)
+            except DroppedFrameError:
+                continue
+            except UnreadableImageError as error:
+                unreadable[index] = str(error)
+                continue
+            paths = [folder / name / f"{len(kept):06d}.png" for name in names]
+            tuple(pool.map(_write_image, paths, images))
+            kept.append(index)
+            times.append(frame.timestamp - float(sequence.timestamps[0]))
     (folder / "times.txt").write_text("".join(f"{t:.9e}\n" for t in times))
     (folder / "calib.txt").write_text(calibration_text(sequence.camera))
     return np.array(kept, np.int64), unreadable
+
+
+def _write_image(path: Path, image: NDArray[np.generic] | None) -> None:
+    import cv2
+
+    assert image is not None
+    pixels = image if image.dtype == np.uint8 else _millimetres(image)
+    if not cv2.imwrite(str(path), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+        raise ResultsError(f"{path}: cannot be written; is the disk full?")
 
 
 def _millimetres(depth: NDArray[np.generic]) -> NDArray[np.uint16]:

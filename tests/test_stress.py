@@ -447,6 +447,7 @@ rows = [f"1 0 0 {0.1 * (i % 3) + (i > 6)} 0 1 0 0 0 0 1 {i}" for i in k]
     ("script", "said"),
     [
         ("sys.exit('no vocabulary')", "exit code 1: no vocabulary"),
+        ("import os; os.kill(os.getpid(), 11)", r"crashed \(SIGSEGV\)"),
         ("sys.stdout.buffer.write(b'\\xff'); sys.stdout.flush(); sys.exit(3)", "exit code 3"),
         ("", "no trajectory.txt"),
         (DRIVES + "(out / 'states.txt').write_text('OK')", "1 states for 12 frames"),

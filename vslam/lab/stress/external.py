@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import signal
 import subprocess
 import tempfile
 import time
@@ -191,9 +192,12 @@ def _call(template: str, sequence: Path, out: Path) -> None:
             code = child.wait()
     except OSError as error:
         raise InputError(f"{words[0]}: cannot be started ({error.strerror}).") from error
+    program = Path(words[0]).name
+    if code < 0:
+        raise InputError(f"{program}: crashed ({signal.Signals(-code).name})")
     if code:
         lines = [line for line in log.splitlines() if line.strip()]
-        raise InputError(f"{words[0]}: exit code {code}: {lines[-1] if lines else 'no output'}")
+        raise InputError(f"{program}: exit code {code}: {lines[-1] if lines else 'no output'}")
 
 
 def _outcome(

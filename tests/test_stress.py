@@ -616,5 +616,6 @@ def test_boundaries_of_two_systems_are_compared_by_their_medians(tmp_path, monke
     assert row["laws_first_more"] == "gamma black_left"
     assert row["laws_second_more"] == "fog"
     assert row["laws_equal"] == "blur"
+    assert row["laws_one_step"] == "gamma"
     assert (row["first_more"], row["second_more"], row["equal"]) == (2, 1, 1)
     assert compare_boundaries.compare(medians, "both", "orbslam3") == []

@@ -5,7 +5,8 @@ python tools/experiments/stress/compare_boundaries.py boundaries.csv ... \\
 
 For each law, the medians over the seeds are compared. The table has a row for each pair of systems
 and each sequence. It contains the laws under which the first system withstands more, those under
-which the second system withstands more, and those under which there is no difference.
+which the second system withstands more, those under which there is no difference, and those under
+which the medians differ by only one of the steps that the bisection distinguishes.
 """
 
 from __future__ import annotations
@@ -17,30 +18,31 @@ from pathlib import Path
 from statistics import median
 
 from vslam.datasets.perturbation import LAWS
+from vslam.lab.stress.search import strength_at
 
-Medians = dict[tuple[str, str], dict[str, float]]  # (sequence, system) -> law -> severity
+Medians = dict[tuple[str, str], dict[str, float]]  # (sequence, system) -> law -> steps
+STEPS = 16  # strengths that four bisections distinguish
 
 
-def severity(law: str, strength: str) -> float:
-    """Return a number that grows with the severity of a perturbation.
+def steps(law: str, strength: str) -> int:
+    """Return the step of a strength, from 0 for the weakest strength to 16 for the greatest.
 
-    ``strength`` is empty if the system failed at all tested strengths. The number is then smaller
-    than that of every strength.
+    ``strength`` is empty if the system failed at all tested strengths. The step is then 0.
     """
     if not strength:
-        return float("-inf")
-    kind = LAWS[law]
-    return float(strength) if kind.strongest > kind.weakest else -float(strength)
+        return 0
+    value = float(strength)
+    return min(range(STEPS + 1), key=lambda step: abs(strength_at(LAWS[law], step / STEPS) - value))
 
 
 def read_medians(paths: list[Path]) -> Medians:
-    """Read tables of ``vslam stress``, and return the median severity that was withstood."""
+    """Read tables of ``vslam stress``, and return the median step that was withstood."""
     found: dict[tuple[str, str, str], list[float]] = defaultdict(list)
     for path in paths:
         with path.open(newline="") as file:
             for row in csv.DictReader(file):
                 key = row["sequence"], row["system"], row["law"]
-                found[key].append(severity(row["law"], row["holds_to"]))
+                found[key].append(steps(row["law"], row["holds_to"]))
     medians: Medians = defaultdict(dict)
     for (sequence, system, law), values in found.items():
         medians[sequence, system][law] = median(values)
@@ -58,6 +60,7 @@ def compare(medians: Medians, first: str, second: str) -> list[dict[str, object]
         more = [law for law in common if one[law] > other[law]]
         less = [law for law in common if one[law] < other[law]]
         same = [law for law in common if one[law] == other[law]]
+        near = [law for law in common if abs(one[law] - other[law]) == 1]
         rows.append(
             {
                 "sequence": sequence,
@@ -67,9 +70,11 @@ def compare(medians: Medians, first: str, second: str) -> list[dict[str, object]
                 "first_more": len(more),
                 "second_more": len(less),
                 "equal": len(same),
+                "one_step": len(near),
                 "laws_first_more": " ".join(more),
                 "laws_second_more": " ".join(less),
                 "laws_equal": " ".join(same),
+                "laws_one_step": " ".join(near),
             }
         )
     return rows

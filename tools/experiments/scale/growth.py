@@ -165,7 +165,7 @@ def measure_loop(n: int) -> dict[str, float]:
     town, config = build_town(n), Config().pose_graph
     map_ = build_map(town)
     match, query = town.crossings[-1].tolist()
-    # The graph must be connected, so each crossing street is a branch of the street that it meets.
+    # In the tree, a street along x begins at a crossing, not at the end of the previous street.
     for first, second in town.crossings[::-1].tolist():
         if town.starts_street[second]:
             map_.parents[second] = first

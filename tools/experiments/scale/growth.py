@@ -82,11 +82,10 @@ def build_town(n: int) -> Town:
     local = np.stack([side, up, ahead], axis=2)
     points = np.einsum("nij,nkj->nki", T_wc[:, :3, :3], local) + T_wc[:, None, :3, 3]
 
-    first_at = {tuple(p): k for k, p in enumerate(place.tolist()) if not across[k]}
+    places = [tuple(one) for one in place.tolist()]
+    along_z = {places[k]: k for k in np.flatnonzero(~across).tolist()}
     pairs = [
-        (first_at[tuple(place[k])], int(k))
-        for k in np.flatnonzero(across)
-        if tuple(place[k].tolist()) in first_at
+        (along_z[places[k]], k) for k in np.flatnonzero(across).tolist() if places[k] in along_z
     ]
     crossings = np.array(pairs, np.int64).reshape(-1, 2)
     # One camera looks along z, the other along x. Both see the landmarks between these directions.

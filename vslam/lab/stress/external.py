@@ -27,6 +27,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,7 +159,7 @@ def export_kitti(
     return np.array(kept, np.int64), unreadable
 
 
-def _write_image(path: Path, image: NDArray[np.generic] | None) -> None:
+def _write_image(path: Path, image: NDArray[Any] | None) -> None:
     import cv2
 
     assert image is not None

@@ -78,10 +78,8 @@ def peak_memory_mb() -> float:
     import resource
 
     # Linux's getrusage includes the memory of the parent process from before exec.
-    with suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 2**10
+    if found := _property("/proc/self/status", "VmHWM"):
+        return int(found.split()[0]) / 2**10
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
@@ -126,18 +124,19 @@ def set_up_openblas() -> None:
 
 def has_avx2() -> bool:
     """Return whether the processor is known to have AVX2 and FMA (Linux only)."""
-    return {"avx2", "fma"} <= set(_cpu_property("flags").split())
+    return {"avx2", "fma"} <= set(_property("/proc/cpuinfo", "flags").split())
 
 
 def cpu_name() -> str:
     """Return the model name of the processor."""
     # platform.processor() is empty or just "x86_64" on Linux.
-    return _cpu_property("model name") or platform.processor() or platform.machine()
+    model = _property("/proc/cpuinfo", "model name")
+    return model or platform.processor() or platform.machine()
 
 
-def _cpu_property(name: str) -> str:
-    """Return a property of the first processor; empty if the system does not state it."""
-    with suppress(OSError), open("/proc/cpuinfo") as lines:
+def _property(file: str, name: str) -> str:
+    """Return the first value of a name in a file of Linux's ``/proc``; empty if there is none."""
+    with suppress(OSError), open(file) as lines:
         for line in lines:
             if line.startswith(name):
                 return line.partition(":")[2].strip()

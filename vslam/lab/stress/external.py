@@ -139,10 +139,9 @@ def export_kitti(
     )
     for name in names:
         (folder / name).mkdir(parents=True)
+    frames = perturbed(sequence.frames(), perturbation.bound_to(sequence))
     with ThreadPoolExecutor(len(names)) as pool:
-        for index, frame in enumerate(
-            perturbed(sequence.frames(), perturbation.bound_to(sequence))
-        ):
+        for index, frame in enumerate(frames):
             try:
                 images = frame.read(pool.map)
             except DroppedFrameError:

@@ -599,11 +599,11 @@ def test_boundaries_of_two_systems_are_compared_by_their_medians(tmp_path, monke
 
     # The visibility in fog is smaller if the fog is denser. An empty strength is the weakest one.
     held = {
-        ("gamma", "bow"): ["10", "2", "5"], ("gamma", "orbslam3"): ["9", "4", "4"],
-        ("fog", "bow"): ["60"], ("fog", "orbslam3"): ["20"],
-        ("black_left", "bow"): ["10"], ("black_left", "orbslam3"): [""],
-        ("blur", "bow"): ["3"], ("blur", "orbslam3"): ["3"],
-        ("noise", "bow"): ["3"],
+        ("gamma", "bow"): ["10", "1.78", "5.62"], ("gamma", "orbslam3"): ["7.5", "4.22", "4.22"],
+        ("fog", "bow"): ["63.2"], ("fog", "orbslam3"): ["17.3"],
+        ("black_left", "bow"): ["12.5"], ("black_left", "orbslam3"): [""],
+        ("blur", "bow"): ["3.16"], ("blur", "orbslam3"): ["3.16"],
+        ("noise", "bow"): ["3.13"],
     }  # fmt: skip
     rows = [
         f"00,{law},{system},{seed},{strength}\n"

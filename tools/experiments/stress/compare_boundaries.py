@@ -28,11 +28,14 @@ def steps(law: str, strength: str) -> int:
     """Return the step of a strength, from 0 for the weakest strength to 16 for the greatest.
 
     ``strength`` is empty if the system failed at all tested strengths. The step is then 0.
+
+    Raises:
+        ValueError: the search had another number of bisections, so the strength is between steps.
     """
     if not strength:
         return 0
-    value = float(strength)
-    return min(range(STEPS + 1), key=lambda step: abs(strength_at(LAWS[law], step / STEPS) - value))
+    tested = [strength_at(LAWS[law], step / STEPS) for step in range(STEPS + 1)]
+    return tested.index(float(strength))
 
 
 def read_medians(paths: list[Path]) -> Medians:

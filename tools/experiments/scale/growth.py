@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from vslam.backend.bundle_adjustment import BundleProblem
@@ -32,6 +33,7 @@ from vslam.geometry import compose, inverse, inverses, se3_exp
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.vocabulary import load
 from vslam.loops import LoopEdge, PerKeyframe
+from vslam.machine import peak_memory_mb
 from vslam.map import Map
 from vslam.map_kernels import link_many
 from vslam.map_view import local_map
@@ -135,21 +137,19 @@ def measure_keyframe(n: int) -> dict[str, float]:
     """Measure the steps of a new keyframe whose time could depend on the size of the map, and the
     memory of the map and of its visual words."""
     town, vocabulary = build_town(n), load()
-    before = resident_gb("VmRSS")
+    before = memory_gb()
     map_ = build_map(town)
-    of_map = resident_gb("VmRSS") - before
+    of_map = memory_gb() - before
 
     # Words are drawn with the frequency that their weight, log(images / images with it), implies.
     cumulative, rng = np.cumsum(np.exp(-vocabulary.weight.astype(float))), np.random.default_rng(2)
-    drawn = [
-        np.searchsorted(cumulative, cumulative[-1] * rng.random(FEATURES)).astype(np.int32)
-        for _ in range(n)
-    ]
-    known = PerKeyframe(FEATURES * np.arange(n + 1), np.concatenate(drawn))
-    del drawn
-    detector, before = BowDetector(vocabulary), resident_gb("VmRSS")
+    words = np.empty((n, FEATURES), np.int32)
+    for of_keyframe in words:
+        of_keyframe[:] = np.searchsorted(cumulative, cumulative[-1] * rng.random(FEATURES))
+    known = PerKeyframe(FEATURES * np.arange(n + 1), words.ravel())
+    detector, before = BowDetector(vocabulary), memory_gb()
     detector.restore(replace(detector.memory(), tables={"words": known}))
-    of_words = resident_gb("VmRSS") - before
+    of_words = memory_gb() - before
 
     return {
         "query_ms": median_ms(lambda k: detector.query(k, map_), n),
@@ -184,8 +184,8 @@ def measure_bundle(n: int) -> dict[str, float]:
     """Measure global bundle adjustment of all keyframes."""
     adjust_globally(bundle_problem(100), iterations=1)  # compiles the kernels
     problem = bundle_problem(n)
-    before = resident_gb("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM
+    before = memory_gb()
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     start = time.process_time()
     adjust_globally(problem, iterations=0)
     prepared = time.process_time() - start
@@ -194,7 +194,7 @@ def measure_bundle(n: int) -> dict[str, float]:
     return {
         "bundle_preparation_s": prepared,
         "bundle_iteration_s": (time.process_time() - start - prepared) / done,
-        "bundle_gb": resident_gb("VmHWM") - before,
+        "bundle_gb": peak_memory_mb() * 2**20 / 1e9 - before,
     }
 
 
@@ -232,20 +232,17 @@ def median_ms(call: Callable[[int], object], n: int) -> float:
     return float(np.median(times))
 
 
-def resident_gb(key: str) -> float:
-    """Return the memory of this process in GB: ``VmRSS`` is the current memory, ``VmHWM`` the
-    greatest since the start or the last reset."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    kilobytes = next(line.split()[1] for line in lines if line.startswith(f"{key}:"))
-    return int(kilobytes) * 1024 / 1e9
+def memory_gb() -> float:
+    """Return the resident memory of this process, in GB."""
+    return float(psutil.Process().memory_info().rss) / 1e9
 
 
 def measure(n: int) -> dict[str, float]:
     """Run each measurement in a new process, so that memory does not depend on the others."""
     found: dict[str, float] = {}
-    for measurement in (measure_keyframe, measure_loop, measure_bundle):
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(max_workers=1, mp_context=context) as pool:
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, spawn, max_tasks_per_child=1) as pool:
+        for measurement in (measure_keyframe, measure_loop, measure_bundle):
             found |= pool.submit(measurement, n).result()
     return found
 

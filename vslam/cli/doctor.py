@@ -60,7 +60,7 @@ def doctor(
     require_data(given)
     thresholds = read_thresholds(config)
     try:
-        diagnosis = examine(first_frames(open_given(given, Console(shown=True))), thresholds.orb)
+        diagnosis = examine(first_frames(open_given(given, Console(shown=True))), thresholds)
     except InputError as error:
         measured, _, fix = str(error).rstrip(".").rpartition("; ")
         diagnosis = Diagnosis([Finding("input", "fault", measured or fix, fix if measured else "")])

@@ -36,10 +36,12 @@ from vslam.datasets.bag_messages import (
     depth_of,
     grey_of,
     is_depth,
+    levels_of_messages,
     nav_sat_fix,
     stamp_of,
 )
 from vslam.datasets.frames import Images, RawSource, Size, TimedFrame, decoded
+from vslam.datasets.grey_levels import Levels
 from vslam.datasets.image_files import size_text
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 
@@ -55,6 +57,7 @@ _NEEDED = {
     "stereo": "two image topics",
     "rgbd": "an image topic and one of depth",
 }
+_SAMPLES = 8  # images in which the range of the grey values is measured
 _MOST_WAITING = 32  # images of one topic that are kept while they wait for a partner
 
 
@@ -119,8 +122,12 @@ def open_bag(
                 f"{path}: the images of {chosen[0]} have no time stamps (header.stamp is 0); "
                 "record them again with a driver that sets it."
             )
+        grey = chosen[: len(chosen) - depth]
+        levels = levels_of_messages(first_two[0][: len(grey)])
+        if levels is not None:
+            levels = levels_of_messages(_spread(bag, path, grey))
         images = [
-            _decoded(path, topic, message, is_depth, depth_scale)
+            _decoded(path, topic, message, is_depth, depth_scale, levels)
             for topic, message, is_depth in zip(chosen, first_two[0], (False, depth), strict=False)
         ]
         if depth and images[0].shape != images[1].shape:
@@ -136,7 +143,7 @@ def open_bag(
             path=path,
             topics=chosen,
             sizes=sizes[:1] if depth else sizes,
-            play=partial(_play, path, chosen, sizes, depth, depth_scale, pairing),
+            play=partial(_play, path, chosen, sizes, depth, depth_scale, levels, pairing),
             n_expected=_estimated_frames(bag, chosen),
             depth=depth,
             pairing=pairing if len(chosen) == 2 else None,
@@ -149,6 +156,7 @@ def _play(
     sizes: tuple[Size, ...],
     depth: bool,
     scale: float | None,
+    levels: Levels | None,
     pairing: Pairing,
 ) -> Iterator[TimedFrame]:
     def read(messages: tuple[Message, ...], image_map: ImageMap) -> Images:
@@ -156,7 +164,7 @@ def _play(
         return decoded([partial(of_size, *side) for side in sides], image_map)
 
     def of_size(message: Message, topic: str, size: Size, is_depth: bool) -> Image | DepthImage:
-        image = _decoded(path, topic, message, is_depth, scale)
+        image = _decoded(path, topic, message, is_depth, scale, levels)
         if image.shape[::-1] != size:
             raise UnreadableImageError(
                 path,
@@ -170,13 +178,15 @@ def _play(
             yield TimedFrame(
                 stamp_of(pair[0]) / 10**9,
                 partial(read, pair),
-                colour=partial(_in_colour, path, topics[0], pair[0]),
+                colour=partial(_in_colour, path, topics[0], levels, pair[0]),
             )
 
 
-def _in_colour(path: Path, topic: str, message: Message) -> NDArray[np.uint8]:
+def _in_colour(
+    path: Path, topic: str, levels: Levels | None, message: Message
+) -> NDArray[np.uint8]:
     try:
-        return colour_of(message)
+        return colour_of(message, levels)
     except ValueError as error:
         raise UnreadableImageError(path, f"{topic}: {error}.") from error
 
@@ -276,15 +286,30 @@ def _check_metadata(file: Path) -> None:
         raise ValueError(f"{file.name} is larger than {_MOST_METADATA / 1e6:.0f} MB")
 
 
-def _messages(bag: Bag, path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, Message]]:
+def _messages(
+    bag: Bag, path: Path, topics: tuple[str, ...], start: int | None = None
+) -> Iterator[tuple[str, Message]]:
+    """Yield the topics and messages of a bag, from the time ``start`` (ns) at which the bag was
+    recorded."""
     connections = [c for c in bag.connections if c.topic in topics]
     try:
-        for connection, _, data in bag.messages(connections=connections):
+        for connection, _, data in bag.messages(connections=connections, start=start):
             yield connection.topic, bag.deserialize(data, connection.msgtype)
     except Exception as error:  # rosbags raises many kinds, as in _opened
         raise BrokenSourceError(
             f"{path}: the bag is damaged or cut off ({_reason(error)}); copy it again."
         ) from error
+
+
+def _spread(bag: Bag, path: Path, topics: tuple[str, ...]) -> Iterator[Message]:
+    """Yield messages of each topic that are spread over the bag, as far as it can be read."""
+    times = np.linspace(bag.start_time, bag.end_time, _SAMPLES, endpoint=False)
+    try:
+        for start in times.astype(np.int64).tolist():
+            for topic in topics:
+                yield from (m for _, m in islice(_messages(bag, path, (topic,), start), 1))
+    except BrokenSourceError:
+        return
 
 
 def _reason(error: Exception) -> str:
@@ -392,9 +417,14 @@ def _has_depth(bag: Bag, path: Path, topic: str) -> bool:
 
 
 def _decoded(
-    path: Path, topic: str, message: Message, depth: bool, scale: float | None
+    path: Path,
+    topic: str,
+    message: Message,
+    depth: bool,
+    scale: float | None,
+    levels: Levels | None,
 ) -> Image | DepthImage:
     try:
-        return depth_of(message, scale) if depth else grey_of(message)
+        return depth_of(message, scale) if depth else grey_of(message, levels)
     except ValueError as error:
         raise UnreadableImageError(path, f"{topic}: {error}.") from error

@@ -7,6 +7,8 @@ ROS defines the fields of these messages in ``sensor_msgs/Image``, ``CompressedI
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.documents import Document
 from vslam.camera import DepthImage, Image
+from vslam.datasets.grey_levels import Levels, decode, levels_of, upper_bits
 
 Message = Any  # classes that rosbags generates from the bag's message definitions
 
@@ -62,54 +65,90 @@ def nav_sat_fix(message: Message) -> tuple[float, ...]:
     return (stamp_of(message) / 10**9, *map(float, position), *sigma.tolist())
 
 
-def grey_of(message: Message) -> Image:
+def grey_of(message: Message, levels: Levels | None = None) -> Image:
     """Decode an ``Image`` or ``CompressedImage`` to ``(H, W)`` uint8 grey values.
 
-    Only the upper eight bits of 16-bit values are kept.
+    Args:
+        levels: the grey level of each 16-bit value (`levels_of_messages`). None keeps the upper
+            eight bits.
 
     Raises:
         ValueError: the image cannot be decoded.
     """
-    return _decoded(message, "GRAY")
+    return _decoded(message, "GRAY", levels)
 
 
-def colour_of(message: Message) -> NDArray[np.uint8]:
+def colour_of(message: Message, levels: Levels | None = None) -> NDArray[np.uint8]:
     """Decode an image to ``(H, W, 3)`` uint8 red, green, blue. A grey image becomes ``(H, W)``.
 
+    ``levels`` has the same meaning as for `grey_of`.
+
     Raises:
         ValueError: the image cannot be decoded.
     """
-    return _decoded(message, "RGB")
+    return _decoded(message, "RGB", levels)
 
 
-def _decoded(message: Message, wanted: str) -> NDArray[np.uint8]:
+def levels_of_messages(messages: Iterable[Message]) -> Levels | None:
+    """Choose the grey levels for the images of a drive from samples of these images.
+
+    Returns:
+        The levels. None if no image has more than 8 bits. Images that cannot be decoded are
+        ignored.
+    """
+    images = map(_of_any_depth, messages)
+    return levels_of(image for image in images if image is not None)
+
+
+def _of_any_depth(message: Message) -> NDArray[Any] | None:
+    import cv2
+
+    try:
+        if hasattr(message, "encoding"):
+            return _raw(message)[0]
+        return _decompressed(message, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH, None)
+    except ValueError:
+        return None
+
+
+def _decompressed(message: Message, flags: int, levels: Levels | None) -> NDArray[Any]:
+    import cv2
+
+    try:
+        image = decode(np.asarray(message.data, np.uint8).tobytes(), flags, levels)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise ValueError(f"a compressed image of format '{message.format}' cannot be decoded")
+    return image
+
+
+def _decoded(message: Message, wanted: str, levels: Levels | None) -> NDArray[np.uint8]:
     """Decode an image to ``GRAY`` or ``RGB``. A grey image stays grey."""
     import cv2
 
-    from vslam.datasets.png import decode_with_opencv
-
     if not hasattr(message, "encoding"):
-        try:
-            data = np.asarray(message.data, np.uint8).tobytes()
-            grey = wanted == "GRAY"
-            image = decode_with_opencv(data, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_ANYCOLOR)
-        except cv2.error:
-            image = None
-        if image is None:
-            raise ValueError(f"a compressed image of format '{message.format}' cannot be decoded")
+        grey = wanted == "GRAY"
+        flags = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_ANYCOLOR
+        image = _decompressed(message, flags, levels)
         return np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
-    encoding = _ALIASES.get(message.encoding, message.encoding)
-    name, bits = (encoding[:-2], 16) if encoding.endswith("16") else (encoding[:-1], 8)
-    if name not in _ENCODINGS or not encoding.endswith(str(bits)):
-        known = ", ".join(f"{known}8" for known in _ENCODINGS)
-        raise ValueError(f"encoding '{message.encoding}' is unknown; known are {known}")
-    channels, colours = _ENCODINGS[name]
-    image = _pixels(message, channels, bits)
-    if bits == 16:
-        image = (image.astype(np.uint16) >> 8).astype(np.uint8)
+    image, colours = _raw(message)
+    if image.dtype.itemsize == 2:
+        image = (upper_bits() if levels is None else levels)[image]
     if colours not in (None, wanted):
         image = cv2.cvtColor(image, getattr(cv2, f"COLOR_{colours}2{wanted}"))
     return np.ascontiguousarray(image, np.uint8)
+
+
+def _raw(message: Message) -> tuple[NDArray[Any], str | None]:
+    """Return the pixels of an ``Image`` with 8 or 16 bits, and the name of their colour space."""
+    encoding = _ALIASES.get(message.encoding, message.encoding)
+    found = re.fullmatch(r"(.*\D)(8|10|12|14|16)", encoding)
+    if found is None or found[1] not in _ENCODINGS:
+        known = ", ".join(f"{known}8" for known in _ENCODINGS)
+        raise ValueError(f"encoding '{message.encoding}' is unknown; known are {known}")
+    channels, colours = _ENCODINGS[found[1]]
+    return _pixels(message, channels, 8 if found[2] == "8" else 16), colours
 
 
 def is_depth(message: Message, topic: str) -> bool:

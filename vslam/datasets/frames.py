@@ -51,7 +51,7 @@ class TimedFrame:
             right image. None if both images can only be decoded together, or if there is no right
             image.
         file: file of the left image. None if the image has no file of its own, or if it has to be
-            rectified.
+            rectified or converted to 8 bits.
         colour: function that decodes the left image in colour, ``(H, W, 3)`` uint8 red, green,
             blue. A grey image is ``(H, W)``. None if the source has no colours.
         name: file name of the left image; None if the image has no file of its own.

@@ -16,6 +16,7 @@ from vslam.calibration.models import Calibration
 from vslam.camera import Camera, DepthImage, Image
 from vslam.datasets.association import Pairing
 from vslam.datasets.frames import RawSource, Size, TimedFrame, check_selection, decoded
+from vslam.datasets.grey_levels import Levels, decode, levels_of_files
 from vslam.errors import InputError, UnreadableImageError
 from vslam.untrusted import MOST_PIXELS, is_image, require_utf8
 
@@ -54,11 +55,13 @@ def checked_files(
     for path in (path for side in sides for path in side):
         check_not_empty(path)
     depth = depth_scale is not None
-    sizes = tuple(image_size(side[0]) for side in (sides[:1] if depth else sides))
+    images = sides[:1] if depth else sides
+    sizes = tuple(image_size(side[0]) for side in images)
+    levels = levels_of_files([side[0] for side in images])
 
     def frame(timestamp: float, *files: Path) -> TimedFrame:
         grey = [
-            partial(_read_grey_of_size, size, file)
+            partial(_read_grey_of_size, size, levels, file)
             for size, file in zip(sizes, files, strict=False)
         ]
         decoders: list[Callable[[], Image | DepthImage]] = [*grey]
@@ -68,8 +71,8 @@ def checked_files(
             timestamp,
             partial(decoded, decoders),
             sides=(grey[0], grey[1]) if len(grey) == 2 else None,
-            file=files[0],
-            colour=partial(read_colour, files[0]),
+            file=files[0] if levels is None else None,
+            colour=partial(read_colour, files[0], levels),
             name=files[0].name,
         )
 
@@ -230,24 +233,26 @@ def check_not_empty(path: Path) -> None:
         raise UnreadableImageError(path, "the file is empty; download it again.")
 
 
-def read_grey(path: Path) -> Image:
+def read_grey(path: Path, levels: Levels | None = None) -> Image:
     """Decode an image file to ``(H, W)`` uint8.
 
-    Colours are converted to grey as defined by ITU-R BT.601. Only the upper eight bits of 16-bit
-    values are kept.
+    Colours are converted to grey as defined by ITU-R BT.601.
+
+    Args:
+        levels: the grey level of each 16-bit value. None keeps the upper eight bits.
 
     Raises:
         UnreadableImageError: the file is missing, damaged or larger than `MOST_PIXELS`.
     """
     import cv2
 
-    from vslam.datasets.png import decode_png, decode_with_opencv
+    from vslam.datasets.png import decode_png
 
     try:
         data = path.read_bytes()
         if (image := decode_png(data)) is not None:
             return image
-        decoded = decode_with_opencv(data, cv2.IMREAD_GRAYSCALE)
+        decoded = decode(data, cv2.IMREAD_GRAYSCALE, levels)
     except cv2.error as error:
         if "MAX_IMAGE" in str(error):
             raise UnreadableImageError(
@@ -261,25 +266,25 @@ def read_grey(path: Path) -> Image:
     return np.asarray(decoded, np.uint8)
 
 
-def read_colour(path: Path) -> NDArray[np.uint8]:
+def read_colour(path: Path, levels: Levels | None = None) -> NDArray[np.uint8]:
     """Decode an image file to ``(H, W, 3)`` uint8 red, green, blue, or ``(H, W)`` if it is grey.
+
+    ``levels`` has the same meaning as for `read_grey`.
 
     Raises:
         UnreadableImageError: the file is missing, damaged or larger than `MOST_PIXELS`.
     """
     import cv2
 
-    from vslam.datasets.png import decode_with_opencv
-
-    grey = read_grey(path)  # raises if the file cannot be decoded
-    decoded = decode_with_opencv(path.read_bytes(), cv2.IMREAD_ANYCOLOR)
+    grey = read_grey(path, levels)  # raises if the file cannot be decoded
+    decoded = decode(path.read_bytes(), cv2.IMREAD_ANYCOLOR, levels)
     if decoded is None or decoded.ndim == 2:
         return grey
     return np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _read_grey_of_size(size: Size, path: Path) -> Image:
-    image = read_grey(path)
+def _read_grey_of_size(size: Size, levels: Levels | None, path: Path) -> Image:
+    image = read_grey(path, levels)
     if image.shape != size[::-1]:
         raise UnreadableImageError(
             path,

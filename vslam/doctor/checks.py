@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, Image, calibration_doubts, field_of_view
-from vslam.config import OrbConfig
 from vslam.doctor.findings import Finding, judge
 from vslam.doctor.focal_length import FocalFit
 from vslam.doctor.matching import Matches, count_views
 from vslam.errors import counted
-from vslam.frontend.orb import extract
 
 Times = NDArray[np.float64]
 Depth = NDArray[Any]  # any type of number; 0 or NaN means that the depth is missing
@@ -210,14 +208,17 @@ def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, in
     return finding, best if wrong else 0
 
 
-def check_features(images: Sequence[Image], config: OrbConfig) -> Finding:
-    """Check the number of features in each image."""
-    counts = [len(extract(image, config).xy) for image in images]
+def check_features(counts: Sequence[int], requested: int) -> Finding:
+    """Check the number of features that a run extracts from each examined frame.
+
+    Args:
+        requested: the number of features that the extraction is asked for.
+    """
     middle = int(np.median(counts))
     return judge(
         "features",
-        middle < FEATURES * config.n_features,
-        f"median {middle}, least {min(counts)} of {config.n_features} requested features",
+        middle < FEATURES * requested,
+        f"median {middle}, least {min(counts)} of {requested} requested features",
         "too little texture or light: use more light, a longer exposure, or a lower threshold "
         "(docs/reference/thresholds.md)",
     )

@@ -14,13 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, DepthImage, Image
-from vslam.config import OrbConfig
+from vslam.config import Config
 from vslam.datasets.frames import Source
 from vslam.doctor import checks
 from vslam.doctor.findings import Finding, judge, sections
 from vslam.doctor.focal_length import Moved, fit_focal_length
 from vslam.doctor.matching import Matches, joined, match_images
 from vslam.errors import UnreadableImageError, counted, write_file
+from vslam.frontend.extraction import find_corners
+from vslam.frontend.masks import Mask
+from vslam.frontend.tracking import TrackingContext
 from vslam.report.page import Figure, Page, Section
 from vslam.report.render import html
 
@@ -57,10 +60,11 @@ class Diagnosis:
         return [finding for finding in self.findings if finding.verdict == "fault"]
 
 
-def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
+def examine(sequence: Source, config: Config) -> Diagnosis:
     """Run all checks that apply to a stereo, RGB-D or monocular sequence.
 
-    The checks examine rectified images, as a run uses them.
+    The checks examine rectified images, as a run uses them. Features are extracted as in a run on
+    the left images.
     """
     frames = np.unique(np.linspace(0, len(sequence) - 1, _FRAMES).round().astype(int)).tolist()
     read: dict[int, tuple[Image, Image | DepthImage | None]] = {}
@@ -83,7 +87,9 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
     lefts = {frame: left for frame, (left, _) in read.items()}
     if lefts:
         images = list(lefts.values())
-        findings += [checks.check_features(images, config), checks.check_sharpness(images)]
+        counts = _count_features(sequence, lefts, config)
+        findings.append(checks.check_features(counts, config.orb.n_features))
+        findings.append(checks.check_sharpness(images))
     findings += checks.check_times(sequence.timestamps)
     if (pairing := sequence.pairing) is not None:
         findings.append(judge("partners", pairing.is_poor, pairing.measured, pairing.fix))
@@ -100,6 +106,22 @@ def examine(sequence: Source, config: OrbConfig) -> Diagnosis:
         found += _examine_focal_length(sequence, found)
         pictures = [_depth_picture(images[0], seconds[0])]
     return Diagnosis(findings + found, hidden + pictures)
+
+
+def _count_features(sequence: Source, lefts: dict[int, Image], config: Config) -> list[int]:
+    context = TrackingContext.create(sequence.camera, config)
+    return [
+        len(find_corners(left, None, context, mask=_mask_of(sequence, frame, config)).found.xy)
+        for frame, left in lefts.items()
+    ]
+
+
+def _mask_of(sequence: Source, frame: int, config: Config) -> Mask | None:
+    stored = sequence.stored[frame].mask
+    try:
+        return None if stored is None else Mask.of(stored(), config.orb)
+    except UnreadableImageError:  # another check reports the mask
+        return None
 
 
 def _examine_mask(sequence: Source, lefts: dict[int, Image]) -> tuple[list[Finding], list[Picture]]:

@@ -14,8 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Image
+from vslam.config import Config
+from vslam.frontend.weak_images import is_faint, with_contrast
 
 _FEATURES = 2000
+_CONFIG = Config.model_validate({"orb": {"n_features": _FEATURES}})
 _MAX_DISTANCE = 64  # bits, of 256; TH_LOW of ORB-SLAM2 is 50
 _EPIPOLAR_PX = 1.5
 _REFINED_PX = 3.0  # largest refinement; keypoints of coarse octaves can be this inaccurate
@@ -42,11 +45,16 @@ class Matches:
 def match_images(left: Image, right: Image) -> Matches:
     """Find ORB matches that satisfy one epipolar geometry, and refine them using optical flow.
 
-    If fewer than twelve matches are found, the result contains no matches.
+    The contrast of faint images is raised first, as in a run. If fewer than twelve matches are
+    found, the result contains no matches.
     """
     orb = cv2.ORB.create(_FEATURES)
     kp_left, d_left = orb.detectAndCompute(left, None)
     kp_right, d_right = orb.detectAndCompute(right, None)
+    if is_faint((left, right), (len(kp_left), len(kp_right)), _CONFIG):
+        left, right = (with_contrast(image, _CONFIG.weak_images) for image in (left, right))
+        kp_left, d_left = orb.detectAndCompute(left, None)
+        kp_right, d_right = orb.detectAndCompute(right, None)
     none = Matches(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
     if len(kp_left) < _MIN_MATCHES or len(kp_right) < _MIN_MATCHES:
         return none

@@ -16,7 +16,8 @@ from sensor_msgs.msg import CameraInfo, Image
 from tf2_msgs.msg import TFMessage
 
 from vslam import Slam
-from vslam.datasets.bag_messages import grey_of, stamp_of
+from vslam.datasets.bag_messages import grey_of, levels_of_messages, stamp_of
+from vslam.datasets.grey_levels import Levels
 from vslam.features import TrackResult
 from vslam.maps.ros import FramePose, odometry_message, static_tf_message, tf_message
 
@@ -42,6 +43,7 @@ class SlamNode(Node):
     def __init__(self) -> None:
         super().__init__("vslam")
         self.slam: Slam | None = None
+        self.levels: Levels | None = None
         self.before: FramePose | None = None
         self.detector = self.declare_parameter("detector", "both").value
         self.map_file = self.declare_parameter("save_map", "").value
@@ -62,8 +64,10 @@ class SlamNode(Node):
             if self.slam is None:
                 self.slam = Slam(camera_of(*infos), detector=self.detector)
                 self.static_tf.publish(static_tf_message(message_type, stamp))
+                self.levels = levels_of_messages((left, right))
             publish = partial(self.publish, stamp)
-            self.slam.step(grey_of(left), grey_of(right), stamp / 1e9, on_pose=publish)
+            images = (grey_of(image, self.levels) for image in (left, right))
+            self.slam.step(*images, stamp / 1e9, on_pose=publish)
         except ValueError as error:  # a wrong camera, or a clock that was set back
             self.get_logger().warning(f"a pair of images is left out: {error}")
 

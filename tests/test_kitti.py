@@ -128,6 +128,54 @@ def test_excerpt_is_matched_by_number_to_longer_times_and_poses(root):
     refused(root, "times.txt: has 5 rows but none for image 000005")
 
 
+def to_colour(root, keep=()):
+    """Replace the grey images with colour images. Camera 2 is 6 cm left of camera 0."""
+    folder = root / "sequences/00"
+    for grey, colour in ((0, 2), (1, 3)):
+        for path in sorted((folder / f"image_{grey}").iterdir()):
+            image = cv2.cvtColor(cv2.imread(str(path), 0), cv2.COLOR_GRAY2BGR)
+            (folder / f"image_{colour}").mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / f"image_{colour}" / path.name), image)
+            if grey not in keep:
+                path.unlink()
+    # The last column is K t. The camera has the centre -t in the frame of camera 0.
+    K = np.array(P0).reshape(3, 4)[:, :3]
+    t = {2: [0.06, 0.001, -0.002], 3: [-0.47, 0.001, -0.002]}
+    rows = {k: row(np.column_stack([K, K @ one]).ravel()) for k, one in t.items()}
+    text = f"P0: {row(P0)}\nP1: {row(P1)}\nP2: {rows[2]}\nP3: {rows[3]}\n"
+    (folder / "calib.txt").write_text(text)
+
+
+def test_colour_images_are_read_without_grey_ones(root):
+    grey = open_kitti(root, "00").read(1)
+    to_colour(root)
+    sequence = open_kitti(root, "00")
+    assert sequence.camera.baseline == pytest.approx(0.53, abs=1e-6)
+    for image, expected in zip(sequence.read(1), grey, strict=True):
+        np.testing.assert_array_equal(image, expected)
+    # The poses of the ground truth are those of camera 0, and its rotations are the identity.
+    np.testing.assert_allclose(sequence.ground_truth[0, :3, 3], [-0.06, -0.001, 0.002], atol=1e-6)
+    np.testing.assert_allclose(sequence.ground_truth[2, :3, 3], [-0.06, -0.001, 2.002], atol=1e-6)
+    assert open_kitti(root, "00", monocular=True).camera.sensor == "mono"
+    assert list_kitti(root) == [("00", FRAMES, FRAMES)]
+
+
+def test_grey_images_come_first_where_they_are_complete(root):
+    to_colour(root, keep=(0, 1))
+    assert open_kitti(root, "00").camera.baseline == 0.5
+    for path in (root / "sequences/00/image_1").iterdir():
+        path.unlink()
+    assert open_kitti(root, "00").camera.baseline == pytest.approx(0.53, abs=1e-6)
+    assert open_kitti(root, "00", monocular=True).stored[0].file.parent.name == "image_0"
+
+
+def test_colour_images_need_their_own_matrices(root):
+    text = (root / "sequences/00/calib.txt").read_text()
+    to_colour(root)
+    (root / "sequences/00/calib.txt").write_text(text)
+    refused(root, "calib.txt: P2 is not a row of 12 numbers")
+
+
 def test_no_ground_truth(root):
     (root / "poses/00.txt").unlink()
     assert open_kitti(root, "00").ground_truth is None
@@ -172,7 +220,7 @@ def test_start_beyond_the_end(root):
 def test_no_images_of_one_camera(root, side, word):
     for path in (root / f"sequences/00/image_{side}").iterdir():
         path.unlink()
-    refused(root, f"image_{side}", f"no images of the {word} camera", "22 GB")
+    refused(root, f"image_{side}", f"no images of the {word} camera")
 
 
 def test_the_left_camera_alone(root):
@@ -203,12 +251,12 @@ def test_unequal_counts(root):
     for k in (4, 5):
         (root / f"sequences/00/image_1/{k:06d}.png").unlink()
     refused(root, "6 left and 4 right", "4 frames have both", "image_1/000004", "--max-frames 4")
-    refused(root, "restore image_1/000004", start=4)
+    refused(root, "; restore ", "image_1/000004.", start=4)
 
 
 def test_left_image_missing(root):
     (root / "sequences/00/image_0/000000.png").unlink()
-    refused(root, "5 left and 6 right", "restore image_0/000000")
+    refused(root, "5 left and 6 right", "; restore ", "image_0/000000.")
 
 
 def test_zero_byte_image_anywhere(root):

@@ -31,6 +31,8 @@ def test_files_devices_and_urls(tmp_path, monkeypatch, data, dataset):
     [
         ("sequences/00/image_0/000000.png", "kitti"),
         ("dataset/sequences/00/times.txt", "kitti"),
+        ("image_00/data/0000000000.png", "kitti_raw"),
+        ("2011_09_26/2011_09_26_drive_0005_sync/image_02/data/0.png", "kitti_raw"),
         ("mav0/cam0/data.csv", "euroc"),
         ("V1_01_easy/mav0/cam0/data.csv", "euroc"),
         ("rgb.txt", "tum"),
@@ -38,6 +40,7 @@ def test_files_devices_and_urls(tmp_path, monkeypatch, data, dataset):
         ("1.png", "images"),
         ("image_0/1.jpg", "images"),
         ("cam0/data/1.png", "images"),
+        ("image_2/1.png", "images"),
         ("rgb/1.png", "images"),
         ("metadata.yaml", "bag"),
     ],

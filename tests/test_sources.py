@@ -249,6 +249,22 @@ def test_an_image_too_large_for_pillow_has_no_time_in_exif(tmp_path):
         open_from("images", tmp_path, SourceOptions(calib=(calib,)), sensor="mono")
 
 
+@pytest.mark.parametrize(
+    "dates",
+    [
+        ["2011-09-26 13:02:25.250000123", "2011-09-26 13:02:25.350000000"],
+        ["2011-09-26T13:02:25.25Z", "2011-09-26T13:02:25.35Z"],
+        ["2011-09-26T15:02:25.250+02:00", "2011-09-26T15:02:25.350+02:00"],
+    ],
+)
+def test_lists_of_dates(corridor, tmp_path, dates):
+    write_images(tmp_path, {"a/data": corridor.left[:2]}, ["0.png", "1.png"])
+    (tmp_path / "a/timestamps.txt").write_text("".join(f"{date}\n" for date in dates))
+    options = SourceOptions(calib=(write_calibration(tmp_path / "c.yaml", corridor.camera),))
+    source = open_from("images", tmp_path / "a/data", options, sensor="mono")
+    np.testing.assert_allclose(source.timestamps - 1317042145.25, [0.0, 0.1], atol=2e-6)
+
+
 def test_frames_a_second_come_before_all_other_times(folder):
     options = SourceOptions(calib=(folder / "stereo.yaml",), fps=4.0)
     source = open_from("images", folder / "images", options)

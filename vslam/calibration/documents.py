@@ -87,7 +87,7 @@ class Document:
         if isinstance(value, Mapping):  # OpenCV's, ROS's and EuRoC's matrices
             value = value.get("data", [])
         try:
-            found = tuple(float(text) for text in _flat(value))
+            found = tuple(float(word) for text in _flat(value) for word in text.split())
         except ValueError:
             found = ()
             counts = counts or (-1,)

@@ -206,6 +206,50 @@ def read_orbslam(documents: Sequence[Document], size: Size | None) -> Calibratio
     return _pair(source, left, left, _shift(baseline))
 
 
+def read_kitti_raw(
+    document: Document, size: Size, cameras: tuple[int, ...] = (0, 1)
+) -> Calibration:
+    """Read ``calib_cam_to_cam.txt`` of KITTI raw, which describes four cameras.
+
+    The size of the images tells whether they are rectified (``S_rect``) or not (``S``).
+
+    Args:
+        size: width and height of the images.
+        cameras: numbers of the left and the right camera, or of the only camera.
+    """
+    source = document.source
+    names = [f"{number:02}" for number in cameras]
+    rectified, original = (document.integers(f"{key}_{names[0]}", 2) for key in ("S_rect", "S"))
+    if size == rectified:
+        P = [document.matrix(f"P_rect_{name}", 3, 4) for name in names]
+        K = [one[:, :3] for one in P]
+        distortions: list[tuple[float, ...]] = [()] * len(P)
+    elif size == original:
+        K = [document.matrix(f"K_{name}", 3, 3) for name in names]
+        distortions = [document.numbers(f"D_{name}", 5) for name in names]
+    else:
+        raise InputError(
+            f"{source}: made for images of {rectified[0]}x{rectified[1]} (rectified) or "
+            f"{original[0]}x{original[1]} pixels but the images have {size[0]}x{size[1]}; take "
+            "the original images, or give another calibration with --calib."
+        )
+    models = [
+        _camera(source, "pinhole", (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), distortion, size)
+        for k, distortion in zip(K, distortions, strict=True)
+    ]
+    if len(models) == 1:
+        return Calibration(models[0], source=source)
+    if size == rectified:
+        # The last column is K t, and t is the camera's translation from camera 0.
+        left, right = ((one[0, 3] - one[0, 2] * one[2, 3]) / one[0, 0] for one in P)
+        return _pair(source, models[0], models[1], _shift(left - right))
+    T_left_0, T_right_0 = (
+        _rigid(document.matrix(f"R_{name}", 3, 3), np.array(document.numbers(f"T_{name}", 3)))
+        for name in names
+    )
+    return _pair(source, models[0], models[1], T_left_0 @ _inverse(T_right_0))
+
+
 def _own_camera(document: Document, size: Size | None) -> CameraModel:
     _refuse_unknown(document, _OWN_CAMERA_KEYS)
     lens = document.text("lens") if "lens" in document else "pinhole"

@@ -130,7 +130,8 @@ def _fixes(path: Path, antenna: tuple[float, ...] | None, source: Source) -> Fix
     """Read the GPS fixes. Their times must overlap with the times of the images."""
     from vslam.datasets.fixes import read_fixes, require_overlap
 
-    fixes = read_fixes(path, antenna)
+    first_image = float(source.timestamps[0]) if source.seekable else 0.0
+    fixes = read_fixes(path, antenna, first_image)
     require_overlap(fixes, source, path)
     return fixes
 

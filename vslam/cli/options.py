@@ -25,7 +25,7 @@ def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
     return (*names, *(name for name in plugins.find_plugins(group) if name not in names))
 
 
-_DATASETS = _with_plugins(("kitti", "euroc", "tum", "synthetic"), plugins.READERS)
+_DATASETS = _with_plugins(("kitti", "kitti_raw", "euroc", "tum", "synthetic"), plugins.READERS)
 _DEPTH_CAMERAS = ("realsense", "oakd")
 _SOURCES = ("images", "video", "bag", "camera", *_DEPTH_CAMERAS)
 DETECTOR_NAMES = _with_plugins(

@@ -15,7 +15,7 @@ from vslam.datasets.frames import Source
 from vslam.errors import InputError, did_you_mean
 
 _DEFAULT_NAME = "00"  # of KITTI and of the rendered towns
-DATASETS = ("kitti", "euroc", "tum", "synthetic")  # plug-ins may add others
+DATASETS = ("kitti", "kitti_raw", "euroc", "tum", "synthetic")  # plug-ins may add others
 
 
 def open_sequence(
@@ -38,7 +38,7 @@ def open_sequence(
         root: folder of the data set. It is ignored for rendered towns, which are rendered into the
             user's cache when they are first used.
         name: name of the sequence. None opens sequence 00 of KITTI or of the rendered towns. For
-            EuRoC and TUM, None opens the only sequence in ``root``.
+            KITTI raw, EuRoC and TUM, None opens the only sequence in ``root``.
         start, every, max_frames: read the frames ``start``, ``start + every`` and so on, at most
             ``max_frames`` frames.
         monocular: read only the left camera.
@@ -58,6 +58,10 @@ def open_sequence(
         from vslam.datasets.kitti import open_kitti
 
         return open_kitti(root, _DEFAULT_NAME if name is None else name, calib=calib, **chosen)
+    if dataset == "kitti_raw":
+        from vslam.datasets.kitti_raw import open_kitti_raw
+
+        return open_kitti_raw(root, name, calib=calib, **chosen)
     if dataset == "euroc":
         from vslam.datasets.euroc import open_euroc
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from vslam.datasets.euroc import is_euroc
 from vslam.datasets.image_folders import has_images
+from vslam.datasets.kitti_raw import is_kitti_raw
 from vslam.datasets.tum import is_tum
 from vslam.errors import InputError
 from vslam.untrusted import is_image
@@ -35,6 +36,13 @@ _KINDS: tuple[tuple[str, str, Callable[[Path], bool]], ...] = (
         "kitti",
         "a folder 'sequences'",
         lambda path: any((path / name).is_dir() for name in ("sequences", "dataset/sequences")),
+    ),
+    (
+        "kitti_raw",
+        "a folder 'image_00/data' or 'image_02/data'",
+        lambda path: any(
+            is_kitti_raw(folder) for folder in (*_with_subfolders(path), *path.glob("*/*/"))
+        ),
     ),
     (
         "euroc",

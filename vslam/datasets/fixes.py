@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from vslam.datasets.bag import read_fixes_of_bag
 from vslam.datasets.detection import is_bag
 from vslam.datasets.frames import Source
+from vslam.datasets.image_folders import read_times
 from vslam.errors import InputError
 from vslam.trajectory import read_table
 
@@ -32,6 +33,7 @@ _NAMES = {
     "altitude": ("altitude", "alt"),
     "sigma": ("sigma",),
 }
+_SINCE_1970_S = 1e8  # smaller times are counted from another moment
 _OXTS_COLUMNS, _POS_ACCURACY = 30, 23  # numbers in an OXTS packet, and the index of pos_accuracy
 
 
@@ -70,17 +72,21 @@ class Fixes:
         )
 
 
-def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
+def read_fixes(
+    path: Path, antenna: Sequence[float] | None = None, first_image: float = 0.0
+) -> Fixes:
     """Read all fixes of a file or folder.
 
     Args:
         path: a CSV file, the folder ``oxts`` of KITTI raw, or a bag. The first line of a CSV file
             names its columns: ``time`` (s), ``latitude`` and ``longitude`` (degrees), ``altitude``
-            (m) and optionally ``sigma`` (m). For KITTI raw, the time of the first fix is 0.
+            (m) and optionally ``sigma`` (m).
         antenna: position of the antenna in the frame of the left camera (x right, y down, z
             forward), in metres. If it is None, the position is read from the calibration of KITTI
             raw. If there is no such calibration, the function assumes that the antenna is at the
             camera.
+        first_image: time of the first image in seconds. If it is not a time since 1970, the times
+            of KITTI raw's fixes are counted from the first fix, as in KITTI odometry.
 
     Raises:
         InputError: pymap3d is not installed, the file is missing or malformed, it contains no fix
@@ -99,6 +105,8 @@ def read_fixes(path: Path, antenna: Sequence[float] | None = None) -> Fixes:
     elif path.is_dir():
         folder = path / "oxts" if (path / "oxts").is_dir() else path
         rows = _read_oxts(folder)
+        if first_image < _SINCE_1970_S:
+            rows[:, 0] -= rows[0, 0]
         if antenna is None:
             antenna = _antenna_of_kitti(folder.resolve().parent.parent)
     else:
@@ -216,27 +224,20 @@ def _read_csv(path: Path) -> NDArray[np.float64]:
 def _read_oxts(folder: Path) -> NDArray[np.float64]:
     """Return ``(M, 7)`` fixes in the format of `vslam.datasets.bag.read_fixes_of_bag`.
 
-    The first fix has the time 0, as in KITTI odometry.
+    The times are in seconds since 1970.
     """
     files = sorted((folder / "data").glob("*.txt"))
     if not files:
         raise InputError(f"--gps {folder}: no data/*.txt; give the folder oxts of KITTI raw.")
     path = folder / "timestamps.txt"
-    try:
-        stamps = [line.strip().replace(" ", "T") for line in path.read_text().splitlines()]
-        times = np.array([stamp for stamp in stamps if stamp], "datetime64[ns]")
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"--gps {path}: the times of the fixes are missing or damaged; unpack the drive again."
-        ) from error
+    times = read_times(path)
     if len(times) != len(files):
         raise InputError(
-            f"--gps {path}: {len(times)} times for {len(files)} fixes; unpack the drive again."
+            f"--gps {path}: {len(times)} times for {len(files)} fixes; take both from one drive."
         )
-    seconds = (times - times[0]) / np.timedelta64(1, "s")
     rows = np.array([read_table(file, (_OXTS_COLUMNS,), "an OXTS packet", 1)[0] for file in files])
     sigma = np.repeat(rows[:, [_POS_ACCURACY]], 3, axis=1)
-    return np.column_stack([seconds, rows[:, :3], sigma])
+    return np.column_stack([times, rows[:, :3], sigma])
 
 
 def _antenna_of_kitti(folder: Path) -> Sequence[float] | None:

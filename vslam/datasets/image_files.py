@@ -167,7 +167,7 @@ def read_image_list(
 
 
 def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:
-    """Find the folder of a sequence, which is either ``root`` or a subfolder of ``root``.
+    """Find the folder of a sequence: ``root``, or a folder one or two levels below it.
 
     Args:
         name: name of the sequence's folder. None finds ``root`` itself or, if it is not a sequence,
@@ -190,12 +190,16 @@ def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bo
                 "another folder with --data."
             )
         return root
-    inside = sorted(p.name for p in root.iterdir() if is_sequence(p)) if root.is_dir() else []
-    if name is None and len(inside) == 1:
-        return root / inside[0]
+    inside: list[Path] = []
+    for level in ("*/", "*/*/"):
+        inside = inside or sorted(path for path in root.glob(level) if is_sequence(path))
+    chosen = [path for path in inside if name in (None, path.name)]
+    if len(chosen) == 1:
+        return chosen[0]
     if inside:
         wrong = f"{root}: several sequences" if name is None else f"{root / name}: no such sequence"
-        raise InputError(f"{wrong}; choose one with --seq: {', '.join(inside)}.")
+        names = ", ".join(path.name for path in inside)
+        raise InputError(f"{wrong}; choose one with --seq: {names}.")
     return None
 
 

@@ -11,7 +11,7 @@ The times of the images are taken from the first of these sources that exists:
 
 1. ``--fps``.
 2. ``times.txt`` or ``timestamps.txt`` in the folder of the images or in its parent. Each line
-   contains the time of one image in seconds.
+   contains the time of one image, in seconds or as a date and time (ISO 8601).
 3. File names that are times since 1970. A name with a decimal point is in seconds. The magnitude of
    an integer tells whether its unit is s, ms, us or ns. Integers that are too small to be such a
    time are treated as frame numbers.
@@ -46,6 +46,9 @@ PAIRS = (
     ("image_left", "image_right"),
     ("cam0", "cam1"),
     ("cam0/data", "cam1/data"),
+    ("image_2", "image_3"),
+    ("image_00/data", "image_01/data"),
+    ("image_02/data", "image_03/data"),
 )
 DEPTH_PAIRS = (("rgb", "depth"), ("color", "depth"), ("colour", "depth"), ("image", "depth"))
 # Longest median interval between images. A longer one suggests that the times are not in seconds.
@@ -275,7 +278,7 @@ def _find_times(folder: Path, files: list[Path]) -> NDArray[np.float64]:
 
 
 def _times_of_file(path: Path, n: int) -> NDArray[np.float64]:
-    times = read_table(path, (1,), "a time in seconds")[:, 0]
+    times = read_times(path)
     if len(times) != n:
         raise InputError(f"{path}: {len(times)} times for {n} images; write one line per image.")
     if n > 1 and (interval := float(np.median(np.diff(times)))) > _LONGEST_INTERVAL_S:
@@ -284,6 +287,39 @@ def _times_of_file(path: Path, n: int) -> NDArray[np.float64]:
             "nanoseconds; write seconds, or give --fps."
         )
     return times
+
+
+def read_times(path: Path) -> NDArray[np.float64]:
+    """Read a list with one time per line: a number of seconds, or a date and time (ISO 8601).
+
+    Returns:
+        ``(N,)`` float64 seconds. Dates become seconds since 1970.
+
+    Raises:
+        InputError: the file is missing, empty or malformed.
+    """
+    times = []
+    try:
+        for line in path.read_text().splitlines():
+            if line.strip() and not line.startswith("#"):
+                times.append(seconds_of_date(line.strip()))
+    except (OSError, ValueError):  # no list of dates
+        times = []
+    return np.array(times) if times else read_table(path, (1,), "a time in seconds")[:, 0]
+
+
+def seconds_of_date(text: str) -> float:
+    """Convert a date and time of ISO 8601 to seconds since 1970, exact to a microsecond.
+
+    Without a time zone, the time is taken for UTC.
+
+    Raises:
+        ValueError: the text is not a date with a time.
+    """
+    time = datetime.fromisoformat(text)
+    if ":" not in text:  # fromisoformat also accepts numbers such as 20110926
+        raise ValueError(text)
+    return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
 
 
 def _time_of_name(path: Path) -> float | None:

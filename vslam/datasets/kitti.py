@@ -1,4 +1,4 @@
-"""Reads grey stereo sequences of KITTI odometry [Geiger et al., CVPR 2012].
+"""Reads stereo sequences of KITTI odometry [Geiger et al., CVPR 2012].
 
 root/sequences/NN/image_0/000000.png   rectified images of the left camera
 root/sequences/NN/image_1/000000.png   rectified images of the right camera
@@ -6,11 +6,13 @@ root/sequences/NN/calib.txt            calibration
 root/sequences/NN/times.txt            times in seconds
 root/poses/NN.txt                      ground truth, for the sequences 00 to 10
 
-The images may also have other formats, such as JPEG or WebP.
+If there are no grey images, the colour images in image_2 and image_3 are read instead. The images
+may also have other formats, such as JPEG or WebP.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from collections.abc import Sequence as Several
 from pathlib import Path
 
@@ -26,6 +28,8 @@ from vslam.errors import InputError, UnreadableImageError
 from vslam.trajectory import read_kitti_poses, read_table
 
 _HOME = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php"
+_FIX = "take calib.txt of this sequence from KITTI's calibration files"
+_PAIRS = ((0, 1), (2, 3))  # numbers of the grey and of the colour cameras
 
 
 def open_kitti(
@@ -61,18 +65,21 @@ def open_kitti(
     """
     base = _find_root(root)
     folder = _find_sequence(base, name)
-    listed = [list_images(folder / f"image_{side}") for side in range(1 if monocular else 2)]
+    cameras, places, listed = find_cameras(lambda k: folder / f"image_{k}", monocular)
     stems = sorted(set().union(*listed), key=_by_number)
     if not stems:
         raise InputError(
-            f"{folder}: no images in image_0 and image_1; "
-            f"download the grayscale images (22 GB) from {_HOME}."
+            f"{folder}: no images in image_0 and image_1, or in image_2 and image_3; download the "
+            f"grayscale images (22 GB) from {_HOME}."
         )
     chosen = select_frames(folder, len(stems), start, every, max_frames)
-    sides = _files_of_frames(folder, listed, [stems[k] for k in chosen])
+    sides = files_of_frames(places, listed, [stems[k] for k in chosen])
     times = _read_times(folder / "times.txt")
-    frames = _row_numbers(folder / "times.txt", stems, len(times))[chosen]
+    frames = row_numbers(folder / "times.txt", stems, len(times))[chosen]
     truth = _read_ground_truth(base / "poses" / f"{name}.txt", stems, len(times), chosen)
+    own = folder / "calib.txt"
+    if truth is not None and cameras[0] != 0:  # the poses are those of camera 0
+        truth[:, :3, 3] += truth[:, :3, :3] @ _centre(own, cameras[0])
     images = checked_files("kitti", name, times[frames], truth, sides)
     left, *right = (f"{width}x{height}" for width, height in images.sizes)
     if right and right[0] != left:
@@ -84,11 +91,10 @@ def open_kitti(
     if calib:
         return rectified(images, calibration_files.read_calibration(calib, images.sizes[0]))
     width, height = images.sizes[0]
-    camera = read_calibration(folder / "calib.txt", width=width, height=height, monocular=monocular)
     return Source(
         dataset=images.dataset,
         name=name,
-        camera=camera,
+        camera=read_calibration(own, width=width, height=height, cameras=cameras),
         stored=images.stored,
         ground_truth=images.ground_truth,
     )
@@ -101,58 +107,74 @@ def list_kitti(root: Path | str) -> list[tuple[str, int, int]]:
         InputError: ``root`` holds no KITTI data.
     """
     folders = sorted(p for p in (_find_root(root) / "sequences").iterdir() if p.is_dir())
-    return [
-        (p.name, len(list_images(p / "image_0")), len(list_images(p / "image_1"))) for p in folders
-    ]
+    listed = []
+    for folder in folders:
+        left, right = _images_of_sequence(folder)
+        listed.append((folder.name, len(left), len(right)))
+    return listed
 
 
 def read_calibration(
-    path: Path | str, *, width: int, height: int, monocular: bool = False
+    path: Path | str, *, width: int, height: int, cameras: tuple[int, ...] = (0, 1)
 ) -> Camera:
-    """Read the projection matrices P0 and P1 from ``calib.txt``.
+    """Read the projection matrices of one or two cameras from ``calib.txt``.
 
     Args:
         width: image width in pixels. The file does not state the image size.
         height: image height in pixels.
-        monocular: read only P0. The file need not contain P1.
+        cameras: numbers of the left and the right camera, or of the only camera.
 
     Raises:
         InputError: the file is missing or malformed, or its values do not describe a rectified
             pair.
     """
-    fix = "take calib.txt of this sequence from KITTI's calibration files"
-    try:
-        lines = [line.split() for line in Path(path).read_text().splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: the calibration is missing or unreadable; {fix}.") from error
-    keyed = {words[0].rstrip(":"): words[1:] for words in lines if words[0].endswith(":")}
-    names = ["P0"] if monocular else ["P0", "P1"]
-    try:
-        rows = [keyed[name] for name in names] if keyed else lines[: len(names)]
-        P = np.array(rows, dtype=np.float64).reshape(len(names), 3, 4)
-    except (KeyError, ValueError) as error:
-        wanted = "P0 is not a row" if monocular else "P0 and P1 are not two rows"
-        raise InputError(f"{path}: {wanted} of 12 numbers; {fix}.") from error
-    if not np.isfinite(P).all():
-        raise InputError(f"{path}: {' or '.join(names)} holds NaN or infinity; {fix}.")
+    P = _projections(Path(path), cameras)
+    names = " and ".join(f"P{k}" for k in cameras)
     fx, fy, cx, cy = P[0, 0, 0], P[0, 1, 1], P[0, 0, 2], P[0, 1, 2]
     if fx <= 0 or fy <= 0 or not np.allclose(P[0, :, :3], P[-1, :, :3]):
         raise InputError(
-            f"{path}: P0 and P1 do not share one positive focal length and centre, so the pair is "
-            f"not rectified; {fix}."
+            f"{path}: {names} do not share one positive focal length and centre, so the pair is "
+            f"not rectified; {_FIX}."
         )
-    baseline = (P[0, 0, 3] - P[-1, 0, 3]) / fx
-    if baseline <= 0 and not monocular:
+    # The last columns are K t, and t is a camera's translation from camera 0.
+    first, second = (one[0, 3] - cx * one[2, 3] for one in (P[0], P[-1]))
+    baseline = (first - second) / fx
+    if baseline <= 0 and len(cameras) == 2:
         raise InputError(
-            f"{path}: the baseline of P0 and P1 is {baseline:.3f} m but must be positive; {fix}, "
+            f"{path}: the baseline of {names} is {baseline:.3f} m but must be positive; {_FIX}, "
             "or run on the left camera alone with --sensor mono."
         )
     if not (0 < cx < width and 0 < cy < height):
         raise InputError(
             f"{path}: the principal point ({cx:.1f}, {cy:.1f}) lies outside the "
-            f"{width}x{height} image; {fix}."
+            f"{width}x{height} image; {_FIX}."
         )
     return Camera(float(fx), float(fy), float(cx), float(cy), float(baseline), width, height)
+
+
+def _projections(path: Path, cameras: tuple[int, ...]) -> NDArray[np.float64]:
+    """Read the ``(C, 3, 4)`` projection matrices of C cameras."""
+    try:
+        lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: the calibration is missing or unreadable; {_FIX}.") from error
+    keyed = {words[0].rstrip(":"): words[1:] for words in lines if words[0].endswith(":")}
+    names = [f"P{k}" for k in cameras]
+    try:
+        rows = [keyed[name] for name in names] if keyed else [lines[k] for k in cameras]
+        P = np.array(rows, dtype=np.float64).reshape(len(names), 3, 4)
+    except (LookupError, ValueError) as error:
+        wanted = " and ".join(names) + (" is not a row" if len(names) == 1 else " are not two rows")
+        raise InputError(f"{path}: {wanted} of 12 numbers; {_FIX}.") from error
+    if not np.isfinite(P).all():
+        raise InputError(f"{path}: {' or '.join(names)} holds NaN or infinity; {_FIX}.")
+    return P
+
+
+def _centre(path: Path, camera: int) -> NDArray[np.float64]:
+    """Read the ``(3,)`` position of a camera in the frame of camera 0, in metres."""
+    K, Kt = np.split(_projections(path, (camera,))[0], [3], axis=1)
+    return -np.linalg.solve(K, Kt[:, 0])
 
 
 def _find_root(root: Path | str) -> Path:
@@ -171,7 +193,7 @@ def _find_sequence(base: Path, name: str) -> Path:
     folder = base / "sequences" / name
     found = sorted(p for p in (base / "sequences").iterdir() if p.is_dir())
     if name not in [p.name for p in found]:
-        there = [p.name for p in found if list_images(p / "image_0")]
+        there = [p.name for p in found if _images_of_sequence(p)[0]]
         choice = f"choose one of {', '.join(there)}" if there else "no sequence there has images"
         raise InputError(f"{folder}: no such sequence; {choice}.")
     return folder
@@ -181,27 +203,63 @@ def _by_number(stem: str) -> tuple[int, str]:
     return (int(stem) if stem.isdecimal() else -1, stem)
 
 
-def _files_of_frames(
-    folder: Path, sides: list[dict[str, Path]], stems: list[str]
+def _images_of_sequence(folder: Path) -> list[dict[str, Path]]:
+    return find_cameras(lambda k: folder / f"image_{k}", monocular=False)[2]
+
+
+def find_cameras(
+    place: Callable[[int], Path], monocular: bool
+) -> tuple[tuple[int, ...], list[Path], list[dict[str, Path]]]:
+    """Find the images of the grey cameras 0 and 1 or, without these, of the colour cameras 2 and 3.
+
+    Args:
+        place: function that returns the folder of the images of a camera.
+        monocular: find only the images of the left camera.
+
+    Returns:
+        The numbers of the cameras, the folders of their images, and the images of each camera by
+        stem. If no pair is complete, a pair of which one camera has images is returned.
+    """
+    found = []
+    for pair in _PAIRS:
+        cameras = pair[:1] if monocular else pair
+        places = [place(k) for k in cameras]
+        found.append((cameras, places, [list_images(folder) for folder in places]))
+        if all(found[-1][2]):
+            return found[-1]
+    return next((one for one in found if any(one[2])), found[0])
+
+
+def files_of_frames(
+    places: list[Path], sides: list[dict[str, Path]], stems: list[str]
 ) -> list[tuple[Path, ...]]:
+    """Return the files of each camera. Each frame must have an image of every camera.
+
+    Args:
+        places: folder of the images of each camera, for error messages.
+        sides: the images of each camera by stem.
+        stems: stems of the frames.
+
+    Raises:
+        InputError: an image is missing.
+    """
     for side, images in enumerate(sides):
         if not images:
             instead = ", or run on the left camera alone with --sensor mono" if side else ""
             raise InputError(
-                f"{folder}/image_{side}: no images of the {('left', 'right')[side]} camera, but "
-                "stereo needs both cameras; download the grayscale images (22 GB) from "
-                f"{_HOME}{instead}."
+                f"{places[side]}: no images of the {('left', 'right')[side]} camera, but stereo "
+                f"needs both cameras; add them{instead}."
             )
     complete = [all(stem in side for side in sides) for stem in stems]
     if not all(complete):
         first = complete.index(False)
         side = 0 if stems[first] not in sides[0] else 1
-        fix = f"restore image_{side}/{stems[first]}"
+        fix = f"restore {places[side] / stems[first]}"
         if first:
             fix += f" and those after it, or add --max-frames {first}"
         raise InputError(
-            f"{folder}: unequal counts, {len(sides[0])} left and {len(sides[1])} right images, and "
-            f"{len(sides[0].keys() & sides[1].keys())} frames have both; {fix}."
+            f"{places[0]}: unequal counts, {len(sides[0])} left and {len(sides[1])} right "
+            f"images, and {len(sides[0].keys() & sides[1].keys())} frames have both; {fix}."
         )
     return [tuple(side[stem] for stem in stems) for side in sides]
 
@@ -216,8 +274,20 @@ def _read_times(path: Path) -> NDArray[np.float64]:
     return times
 
 
-def _row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]:
-    """Return the row of each image in ``times.txt`` or in the file of the poses, from 0."""
+def row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]:
+    """Return the row of each image in a file with a row for each image of the whole sequence.
+
+    Rows are counted from 0. If the file has more rows than there are images, the stem of an image
+    is the number of its row.
+
+    Args:
+        path: the file, for error messages.
+        stems: stems of the images, in their order.
+        n_rows: number of rows of the file.
+
+    Raises:
+        InputError: the file has no row for one of the images.
+    """
     fix = "take the file of this sequence from KITTI's archives"
     if n_rows < len(stems):
         raise InputError(f"{path}: only {n_rows} rows for {len(stems)} images; {fix}.")
@@ -240,4 +310,4 @@ def _read_ground_truth(
             f"{path}: has {len(poses)} poses, but there are {len(stems)} images and {n_times} "
             "times; take the file of this sequence, or remove it to run without ground truth."
         )
-    return poses[_row_numbers(path, stems, len(poses))[chosen]]
+    return poses[row_numbers(path, stems, len(poses))[chosen]]

@@ -13,6 +13,7 @@ from vslam.datasets import open_sequence
 from vslam.datasets.detection import detect_dataset
 from vslam.datasets.frames import RawSource, Source, selected
 from vslam.datasets.image_files import list_images
+from vslam.datasets.kitti_raw import is_kitti_raw
 from vslam.datasets.masks import with_masks
 from vslam.datasets.rectified import rectified
 from vslam.errors import InputError
@@ -236,6 +237,11 @@ def _calibration(
             raise InputError(
                 f"{options.data}: a sequence of KITTI; open it with --data {folder.parent.parent} "
                 f"--seq {folder.name}, or give a calibration with --calib."
+            )
+        if dataset == "images" and is_kitti_raw(folder.parent.parent):
+            raise InputError(
+                f"{options.data}: images of a drive of KITTI raw; open the drive with --data "
+                f"{folder.parent.parent}, or give a calibration with --calib."
             )
         where = ", and no camera_info in the bag" if dataset == "bag" else ""
         raise InputError(

@@ -76,5 +76,9 @@ def how_to_swap(dataset: str, options: RunOptions) -> str:
         return "give both topics with --topics, that of the left images first"
     if dataset == "video":
         return "swap the halves of the images: the left camera's half must be on the left"
-    folders = {"kitti": "image_0 and image_1", "euroc": "cam0 and cam1"}
+    folders = {
+        "kitti": "image_0 and image_1",
+        "kitti_raw": "image_00 and image_01",
+        "euroc": "cam0 and cam1",
+    }
     return f"swap {folders.get(dataset, 'the images of both cameras')}"

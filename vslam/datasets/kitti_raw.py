@@ -1,0 +1,102 @@
+"""Reads drives of KITTI raw [Geiger et al., IJRR 2013].
+
+DATE/calib_cam_to_cam.txt                     calibration of the four cameras
+DATE/DRIVE/image_00/data/0000000000.png       images of the left grey camera
+DATE/DRIVE/image_00/timestamps.txt            their dates and times
+DATE/DRIVE/image_01/...                       the same for the right grey camera
+DATE/DRIVE/image_02/..., image_03/...         the same for the colour cameras
+
+The names of synchronised drives end in ``_sync``, and their images are rectified. The names of
+unsynchronised drives end in ``_extract``. Their images are rectified when they are read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Several
+from pathlib import Path
+
+import numpy as np
+
+from vslam.calibration.documents import read_document
+from vslam.calibration.files import read_calibration
+from vslam.calibration.formats import Size, read_kitti_raw
+from vslam.calibration.models import Calibration
+from vslam.datasets.frames import Source
+from vslam.datasets.image_files import checked_files, find_sequence, select_frames
+from vslam.datasets.image_folders import read_times
+from vslam.datasets.kitti import files_of_frames, find_cameras, row_numbers
+from vslam.datasets.rectified import rectified
+from vslam.errors import InputError
+
+_CALIBRATION = "calib_cam_to_cam.txt"
+
+
+def open_kitti_raw(
+    root: Path | str,
+    name: str | None = None,
+    *,
+    start: int = 0,
+    every: int = 1,
+    max_frames: int | None = None,
+    monocular: bool = False,
+    calib: Several[Path | str] = (),
+) -> Source:
+    """Open a drive of KITTI raw. The grey images are read or, without these, the colour images.
+
+    The times are those of the left camera, in seconds since 1970. Images of frames that are not
+    selected may be missing.
+
+    Args:
+        root: folder of the drive, or a folder that contains drives or the folders of their dates.
+        name: name of the drive in ``root``. None opens ``root`` itself or the only drive in it.
+        start, every, max_frames: of the existing frames, read ``start``, ``start + every`` and so
+            on, at most ``max_frames`` frames.
+        monocular: read only the left camera.
+        calib: calibration files, which are used instead of ``calib_cam_to_cam.txt`` in the folder
+            of the date.
+
+    Raises:
+        InputError: data is missing, the left or the right image of a frame is missing, or the
+            calibration or the times are unusable.
+        UnreadableImageError: the first pair cannot be decoded.
+    """
+    folder = find_sequence(Path(root), name, is_kitti_raw)
+    if folder is None:
+        raise InputError(
+            f"{root}: holds no drive of KITTI raw (no image_00/data or image_02/data); give the "
+            "folder of a drive or of a date with --data."
+        )
+    cameras, places, listed = find_cameras(lambda k: folder / f"image_{k:02}" / "data", monocular)
+    stems = sorted(set().union(*listed))
+    if not stems:
+        raise InputError(f"{places[0]}: no images in this folder; unpack the images of the drive.")
+    chosen = select_frames(folder, len(stems), start, every, max_frames)
+    sides = files_of_frames(places, listed, [stems[k] for k in chosen])
+    path = places[0].parent / "timestamps.txt"
+    times = read_times(path)
+    times = times[row_numbers(path, stems, len(times))[chosen]]
+    if (np.diff(times) <= 0).any():
+        raise InputError(f"{path}: the times do not increase; give the list of this drive.")
+    images = checked_files("kitti_raw", folder.resolve().name, times, None, sides)
+    return rectified(images, _calibration(folder, calib, images.sizes[0], cameras))
+
+
+def is_kitti_raw(folder: Path) -> bool:
+    """Return whether a folder is a drive of KITTI raw with images."""
+    return any((folder / f"image_{k:02}" / "data").is_dir() for k in range(4))
+
+
+def _calibration(
+    folder: Path, calib: Several[Path | str], size: Size, cameras: tuple[int, ...]
+) -> Calibration:
+    drive = folder.resolve()
+    own = [path / _CALIBRATION for path in (drive.parent, drive) if (path / _CALIBRATION).is_file()]
+    if not calib and not own:
+        raise InputError(
+            f"{drive.parent / _CALIBRATION}: the calibration is missing; unpack the calibration "
+            "of this date, or give another file with --calib."
+        )
+    files = [Path(file) for file in calib or own[:1]]
+    if files[0].is_file() and f"P_rect_{cameras[0]:02}" in (document := read_document(files[0])):
+        return read_kitti_raw(document, size, cameras)
+    return read_calibration(files, size)

@@ -236,10 +236,10 @@ def test_folders_of_images(folder, corridor, tmp_path):
     times = tmp_path / "times.txt"
     times.write_text("0.0\n0.1\n")
     refused("times.txt: 2 times for 3 images", "images", tmp_path, options)
-    times.write_text("0\n100\n200\n")
-    refused("the images are 100 s apart, as if .* milliseconds", "images", tmp_path, options)
+    times.write_text("0\n1\n2\n")
+    refused("0, 1, 2, ... are the numbers of frames, .* --fps", "images", tmp_path, options)
     times.write_text("0.0\n0.2\n0.1\n")
-    refused("left/2.png: its time is not later", "images", tmp_path, options)
+    refused("1 of 3 times are not later .*time 3 .* give --fps", "images", tmp_path, options)
     refused("no such folder", "images", tmp_path / "none", options)
     refused(f"but {tmp_path} has both .give it", "images", tmp_path / "left", options)
     (tmp_path / "calib.txt").write_text("P0: 1")

@@ -324,7 +324,10 @@ def test_missing_calibration(root):
 @pytest.mark.parametrize(
     ("times", "part"),
     [
-        ([0, 0.1, 0.2, 0.2, 0.4, 0.5], "time 4 is not later"),
+        (
+            [0, 0.1, 0.2, 0.2, 0.4, 0.5],
+            "1 of 6 times are not later than those before them (time 4 is the first)",
+        ),
         ([0, 0.1, np.nan, 0.3, 0.4, 0.5], "line 3 holds NaN"),
         ([0, 0.1, 0.2], "only 3 rows for 6 images"),
         ([], "empty"),

@@ -121,11 +121,12 @@ def test_bad_drives(tmp_path):
     stamps = drive / "image_00/timestamps.txt"
     lines = stamps.read_text().splitlines()
     stamps.write_text("\n".join(reversed(lines)))
-    refused("timestamps.txt: the times do not increase", drive)
+    refused("timestamps.txt: 3 of 4 times are not later", drive)
     stamps.write_text(lines[0])
     refused("timestamps.txt: only 1 rows for 4 images", drive)
     stamps.unlink()
     refused("timestamps.txt: cannot read", drive)
+    stamps.write_text("\n".join(lines))
     (drive / "image_01/data/0000000002.png").unlink()
     refused("4 left and 3 right images, .*; restore .*image_01/data/0000000002", drive)
 

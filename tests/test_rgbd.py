@@ -254,7 +254,7 @@ def test_bad_input_of_tum(copy, tmp_path):
     assert open_tum(copy, "").ground_truth is None
     depth = (copy / "depth.txt").read_text().splitlines()
     (copy / "depth.txt").write_text("\n".join(reversed(depth)))
-    refused(copy, "depth.txt: line 2 is not later", "sort")
+    refused(copy, "depth.txt: 15 of 16 times are not later", "correct them")
     (copy / "depth.txt").write_text("1.0 a.png\nsoon b.png\n")
     refused(copy, "depth.txt: line 2", "not a time")
     (copy / "depth.txt").write_text("1.0 a.png\n2.0 b.png\n")

@@ -27,6 +27,15 @@ from vslam.datasets.image_files import (
     select_frames,
 )
 from vslam.datasets.rectified import rectified
+from vslam.datasets.times import (
+    FIX_LIST,
+    UNITS,
+    Number,
+    Timing,
+    number_of,
+    ordered_list,
+    unit_of_list,
+)
 from vslam.errors import InputError
 from vslam.trajectory import Trajectory
 
@@ -67,11 +76,12 @@ def open_euroc(
             unusable.
         UnreadableImageError: the first pair cannot be decoded.
     """
-    base, found, stamps, files, pairing = _select(root, name, start, every, max_frames, monocular)
-    truth = _read_ground_truth(base, stamps)
-    raw = checked_files(
-        "euroc", found, stamps.astype(np.float64) * 1e-9, truth, files, None, pairing
+    base, found, stamps, files, pairing, timing = _select(
+        root, name, start, every, max_frames, monocular
     )
+    truth = _read_ground_truth(base, stamps)
+    times = stamps.astype(np.float64) * 1e-9
+    raw = checked_files("euroc", found, times, truth, files, None, pairing, timing)
     sensors = calib or [base / f"cam{side}" / "sensor.yaml" for side in range(len(files))]
     return rectified(raw, read_calibration(sensors, raw.sizes[0]))
 
@@ -89,9 +99,11 @@ def open_raw_euroc(
 
     The arguments have the same meaning as for `open_euroc`.
     """
-    _, found, stamps, files, pairing = _select(root, name, start, every, max_frames, monocular)
+    _, found, stamps, files, pairing, timing = _select(
+        root, name, start, every, max_frames, monocular
+    )
     times = stamps.astype(np.float64) * 1e-9
-    return checked_files("euroc", found, times, None, files, None, pairing)
+    return checked_files("euroc", found, times, None, files, None, pairing, timing)
 
 
 def is_euroc(root: Path) -> bool:
@@ -106,25 +118,28 @@ def _select(
     every: int,
     max_frames: int | None,
     monocular: bool,
-) -> tuple[Path, str, NDArray[np.int64], list[tuple[Path, ...]], Pairing | None]:
+) -> tuple[Path, str, NDArray[np.int64], list[tuple[Path, ...]], Pairing | None, Timing]:
     """Find a sequence and select frames of it.
 
     Returns:
         The folder that contains ``cam0``, the name of the sequence, the times (ns) and the files of
-        the selected frames, and the pairing of all frames.
+        the selected frames, the pairing of all frames, and how the times were read.
     """
     base, found = _find(Path(root), name)
     cameras = [base / f"cam{side}" for side in range(1 if monocular else 2)]
     listed = [_read_list(camera) for camera in cameras]
-    times = [np.array(stamps, np.int64) for stamps, _ in listed]
+    times = [stamps for stamps, *_ in listed]
+    timing, *others = (timing for *_, timing in listed)
+    for other in others:
+        timing.remarks.extend(other.warnings())
     frames = _pair(cameras, times)
     pairing = None if monocular else _pairing(base, times, frames[:, 0])
     chosen = frames[select_frames(base, len(frames), start, every, max_frames)]
     files = [
         tuple(camera / "data" / names[k] for k in rows)
-        for camera, (_, names), rows in zip(cameras, listed, chosen.T, strict=True)
+        for camera, (_, names, _), rows in zip(cameras, listed, chosen.T, strict=True)
     ]
-    return base, found, times[0][chosen[:, 0]], files, pairing
+    return base, found, times[0][chosen[:, 0]], files, pairing, timing
 
 
 def _find(root: Path, name: str | None) -> tuple[Path, str]:
@@ -141,17 +156,23 @@ def _find(root: Path, name: str | None) -> tuple[Path, str]:
     return base, folder.resolve().name
 
 
-def _read_list(camera: Path) -> tuple[list[int], list[str]]:
+def _read_list(camera: Path) -> tuple[NDArray[np.int64], list[str], Timing]:
     """Read the times (ns, increasing) and the file names of the images of a camera."""
 
-    def parsed(line: str) -> tuple[int, str]:
+    def parsed(line: str) -> tuple[Number, str]:
         stamp, _, name = map(str.strip, line.partition(","))
-        if not stamp.isdecimal() or "/" in name or int(stamp) > np.iinfo(np.int64).max:
+        number = number_of(stamp)
+        if number is None or "/" in name or number > np.iinfo(np.int64).max:
             raise ValueError
-        return int(stamp), name
+        return number, name
 
     instead = "run on the left camera alone with --sensor mono" if camera.name == "cam1" else ""
-    return read_image_list(camera / "data.csv", parsed, "a time in nanoseconds", instead)
+    path = camera / "data.csv"
+    numbers, names = read_image_list(path, parsed, "a time in nanoseconds", instead)
+    unit, timing = unit_of_list(numbers, path, "nanoseconds", FIX_LIST)
+    to_ns = UNITS["nanoseconds"] // UNITS[unit]
+    stamps, kept = ordered_list([int(n * to_ns) for n in numbers], timing, FIX_LIST, 10**9)
+    return np.array(stamps, np.int64), [names[k] for k in kept], timing
 
 
 def _pair(cameras: list[Path], times: list[NDArray[np.int64]]) -> NDArray[np.int64]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from vslam.datasets.bag import read_fixes_of_bag
 from vslam.datasets.detection import is_bag
 from vslam.datasets.frames import Source
-from vslam.datasets.image_folders import read_times
+from vslam.datasets.times import read_times
 from vslam.errors import InputError
 from vslam.trajectory import read_table
 

@@ -9,7 +9,6 @@ A reader returns a `RawSource` if the images still have to be rectified (by
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Several
 from dataclasses import dataclass, replace
@@ -23,12 +22,11 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, DepthImage, Image, ImageMap
 from vslam.datasets.association import Pairing
+from vslam.datasets.times import Timing, in_order
 from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
 
 Images = tuple[Image, Image | DepthImage | None]
 Size = tuple[int, int]
-
-_log = logging.getLogger(__name__)
 
 _FIRST_FRAMES = 120  # a few seconds; a stereo pair of 752x480 pixels takes 0.7 MB
 
@@ -80,6 +78,7 @@ class _Frames:
     live: bool = False
     ground_truth: NDArray[np.float64] | None = None
     pairing: Pairing | None = None
+    timing: Timing | None = None
 
     def __post_init__(self) -> None:
         if not self.seekable:
@@ -155,6 +154,9 @@ class Source(_Frames):
         pairing: how many images were paired with a second image by time, and how many images were
             left out. For a stream, only the images that have been read so far are counted. None if
             images are not paired by time.
+        timing: how the times were read, and how many frames were left out because of their times.
+            For a stream, only the frames that have been read so far are counted. None if all frames
+            have their recorded times.
         rectify_mask: function that rectifies an ``(H, W)`` uint8 mask of the original left images.
             None if vslam does not rectify the images.
 
@@ -211,7 +213,7 @@ def _call(decode: Callable[[], Image | DepthImage]) -> Image | DepthImage:
 def selected(
     source: _AnySource, *, start: int = 0, every: int = 1, max_frames: int | None = None
 ) -> _AnySource:
-    """Select frames of a source.
+    """Select frames of a source. The frames of a stream get increasing times (`in_order`).
 
     Args:
         start, every, max_frames: read the frames ``start``, ``start + every`` and so on, at most
@@ -233,7 +235,9 @@ def selected(
         truth = None if truth is None else truth[chosen]
         return replace(source, stored=source.stored[chosen], ground_truth=truth)
     n = max_frames if whole is None else len(range(*chosen.indices(whole)))
-    return replace(source, n_expected=n, play=partial(_play_selected, source, chosen))
+    timing = Timing(source.name)
+    play = partial(_play_selected, source, chosen, timing)
+    return replace(source, n_expected=n, play=play, timing=timing)
 
 
 def check_selection(start: int, every: int, max_frames: int | None) -> None:
@@ -246,31 +250,17 @@ def check_selection(start: int, every: int, max_frames: int | None) -> None:
         raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
 
 
-def _play_selected(source: Source | RawSource, chosen: slice) -> Iterator[TimedFrame]:
+def _play_selected(
+    source: Source | RawSource, chosen: slice, timing: Timing
+) -> Iterator[TimedFrame]:
     frame = None
-    frames = _increasing(source.frames(), source.name)
-    for frame in islice(frames, chosen.start, chosen.stop, chosen.step):
-        yield frame
+    frames = in_order(((frame.timestamp, frame) for frame in source.frames()), timing)
+    for timestamp, frame in islice(frames, chosen.start, chosen.stop, chosen.step):
+        yield frame if frame.timestamp == timestamp else replace(frame, timestamp=timestamp)
     if frame is None:
         raise InputError(
             f"--start {chosen.start}: {source.name} has no such frame; choose a smaller number."
         )
-
-
-def _increasing(frames: Iterator[TimedFrame], name: str) -> Iterator[TimedFrame]:
-    """Yield the frames, but skip and log each frame that is not later than the previous frame."""
-    last = None
-    for frame in frames:
-        if last is not None and frame.timestamp <= last:
-            _log.warning(
-                "%s: the frame at %.6f s is skipped because it follows a frame at %.6f s",
-                name,
-                frame.timestamp,
-                last,
-            )
-            continue
-        last = frame.timestamp
-        yield frame
 
 
 def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:

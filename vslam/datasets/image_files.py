@@ -17,12 +17,13 @@ from vslam.camera import Camera, DepthImage, Image
 from vslam.datasets.association import Pairing
 from vslam.datasets.frames import RawSource, Size, TimedFrame, check_selection, decoded
 from vslam.datasets.grey_levels import Levels, decode, levels_of_files
+from vslam.datasets.times import Number, Timing
 from vslam.errors import InputError, UnreadableImageError
 from vslam.untrusted import MOST_PIXELS, is_image, require_utf8
 
 # Distance in metres between the projector and the camera of a Kinect (ORB-SLAM2, section III-A).
 _VIRTUAL_BASELINE = 0.08
-_Time = TypeVar("_Time", int, float)
+_Time = TypeVar("_Time", bound=Number)
 
 
 def checked_files(
@@ -33,6 +34,7 @@ def checked_files(
     sides: Several[Several[Path]],
     depth_scale: float | None = None,
     pairing: Pairing | None = None,
+    timing: Timing | None = None,
 ) -> RawSource:
     """Make a source of image files.
 
@@ -47,6 +49,7 @@ def checked_files(
             contains the right images or the depth images.
         depth_scale: depth image units per metre; None if there are no depth images.
         pairing: how many images were paired by time; None if the images were not paired by time.
+        timing: how the times were read.
 
     Raises:
         UnreadableImageError: a file is empty, the first frame cannot be decoded, or the first depth
@@ -84,6 +87,7 @@ def checked_files(
         stored=tuple(map(frame, timestamps.tolist(), *sides)),
         ground_truth=ground_truth,
         pairing=pairing,
+        timing=timing,
     )
     if depth:
         source.read(0)
@@ -126,7 +130,7 @@ def read_image_list(
 ) -> tuple[list[_Time], list[str]]:
     """Read the times and file names of images from a text file with one image per line.
 
-    Lines that begin with # are comments.
+    Lines that begin with # are comments. The times are in the unit and in the order of the file.
 
     Args:
         parsed: function that takes a line, and returns the time and the file name of the image. It
@@ -135,7 +139,7 @@ def read_image_list(
         instead: what the user can do if the file is missing, for error messages. It may be empty.
 
     Raises:
-        InputError: the file is missing, empty or malformed, or the times do not increase.
+        InputError: the file is missing, empty or malformed.
     """
     try:
         lines = path.read_text().splitlines()
@@ -155,10 +159,6 @@ def read_image_list(
             name = ""
         if not name:
             raise InputError(f"{path}: line {number} is not {time} and a file name; repair it.")
-        if times and at <= times[-1]:
-            raise InputError(
-                f"{path}: line {number} is not later than the one before it; sort the list by time."
-            )
         times.append(at)
         names.append(name)
     if not times:

@@ -11,17 +11,16 @@ The times of the images are taken from the first of these sources that exists:
 
 1. ``--fps``.
 2. ``times.txt`` or ``timestamps.txt`` in the folder of the images or in its parent. Each line
-   contains the time of one image, in seconds or as a date and time (ISO 8601).
-3. File names that are times since 1970. A name with a decimal point is in seconds. The magnitude of
-   an integer tells whether its unit is s, ms, us or ns. Integers that are too small to be such a
-   time are treated as frame numbers.
+   contains the time of one image, in seconds or as a date and time (ISO 8601). If the frame rate
+   proves that the unit is ms, us or ns, the times are converted.
+3. File names that are times. The unit is s, ms, us or ns. It follows from the date, or from the
+   frame rate. Integers below 1,000,000,000 in small steps are treated as frame numbers.
 4. ``DateTimeOriginal`` with ``SubSecTimeOriginal`` in the EXIF data of the images.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -37,8 +36,14 @@ from vslam.datasets.image_files import (
     list_images,
     select_frames,
 )
+from vslam.datasets.times import (
+    Timing,
+    number_of,
+    ordered_list,
+    times_of_list,
+    times_of_names,
+)
 from vslam.errors import InputError
-from vslam.trajectory import read_table
 
 PAIRS = (
     ("left", "right"),
@@ -51,14 +56,10 @@ PAIRS = (
     ("image_02/data", "image_03/data"),
 )
 DEPTH_PAIRS = (("rgb", "depth"), ("color", "depth"), ("colour", "depth"), ("image", "depth"))
-# Longest median interval between images. A longer one suggests that the times are not in seconds.
-_LONGEST_INTERVAL_S = 10.0
 _TIME_FILES = ("times.txt", "timestamps.txt")
 _EXIF = 0x8769  # tags of EXIF 2.32
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL = 0x9003, 0x9291
-# Smallest integer that is read as ns, us, ms and s, and number of these units per second. 1e9 s is
-# in the year 2001.
-_UNITS = ((1e17, 10**9), (1e14, 10**6), (1e11, 10**3), (1e9, 1))
+_FIX = "correct them, or give --fps"
 
 
 def has_images(folder: Path) -> bool:
@@ -79,6 +80,7 @@ class ImageFolders:
         depth: whether the second list has depth images.
         size: width and height of the first image.
         pairing: how many images were paired by time; None if the images were not paired by time.
+        timing: how the times were read.
     """
 
     name: str
@@ -87,6 +89,7 @@ class ImageFolders:
     depth: bool
     size: tuple[int, int]
     pairing: Pairing | None = None
+    timing: Timing | None = None
 
     def source(self, depth_scale: float | None) -> RawSource:
         """Make a source of the images.
@@ -105,7 +108,7 @@ class ImageFolders:
             )
         scale = depth_scale if self.depth else None
         return checked_files(
-            "images", self.name, self.timestamps, None, self.sides, scale, self.pairing
+            "images", self.name, self.timestamps, None, self.sides, scale, self.pairing, self.timing
         )
 
 
@@ -143,17 +146,15 @@ def open_images(
     places, is_depth = _find_sides(folder, right, depth, sensor)
     listed = [_sorted_images(place) for place in places]
     files, pairing = _paired(listed, places, by_time=is_depth)
-    n = len(files[0])
-    times = np.arange(n) / fps if fps is not None else _find_times(places[0], files[0])
-    if (bad := np.flatnonzero(np.diff(times) <= 0)).size:
-        raise InputError(
-            f"{files[0][bad[0] + 1]}: its time is not later than that of the image before it; "
-            "repair the times, or give --fps."
-        )
-    chosen = select_frames(folder, n, start, every, max_frames)
-    sides = tuple(tuple(side[k] for k in chosen) for side in files)
-    size = image_size(sides[0][0])
-    return ImageFolders(folder.resolve().name, times[chosen], sides, is_depth, size, pairing)
+    if fps is not None:
+        found, timing = [k / fps for k in range(len(files[0]))], Timing(str(places[0]))
+    else:
+        found, timing = _find_times(places[0], files[0])
+    times, kept = ordered_list(found, timing, _FIX)
+    selected = select_frames(folder, len(kept), start, every, max_frames)
+    sides = tuple(tuple(side[k] for k in kept[selected]) for side in files)
+    size, name = image_size(sides[0][0]), folder.resolve().name
+    return ImageFolders(name, np.array(times)[selected], sides, is_depth, size, pairing, timing)
 
 
 def _find_sides(
@@ -202,8 +203,8 @@ def _near_miss(folder: Path) -> str:
 def _sorted_images(folder: Path) -> dict[str, Path]:
     """List the images of a folder by stem, in the order in which they were taken.
 
-    If not all names are times, the images are sorted by the numbers in their names, so that 2 comes
-    before 10.
+    If not all names are numbers, the images are sorted by the numbers in their names, so that 2
+    comes before 10.
     """
     images = list_images(folder)
     if not images:
@@ -212,9 +213,8 @@ def _sorted_images(folder: Path) -> dict[str, Path]:
     def by_number(stem: str) -> list[tuple[str, int]]:
         return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", stem)]
 
-    times = {stem: _time_of_name(path) for stem, path in images.items()}
-    timed = {stem: time for stem, time in times.items() if time is not None}
-    ordered = sorted(timed, key=timed.__getitem__) if timed.keys() == times.keys() else None
+    numbers = {stem: number for stem in images if (number := number_of(stem)) is not None}
+    ordered = sorted(numbers, key=numbers.__getitem__) if len(numbers) == len(images) else None
     return {stem: images[stem] for stem in ordered or sorted(images, key=by_number)}
 
 
@@ -242,10 +242,12 @@ def _paired_by_time(
 ) -> tuple[list[list[Path]], Pairing] | None:
     """Pair the files of two folders by the times in their names. None if a name is not a time."""
     files = [list(side.values()) for side in (first, second)]
-    times = [[_time_of_name(path) for path in side] for side in files]
-    if any(time is None for side in times for time in side):
+    found = [
+        times_of_names(list(side), files[k][0].parent) for k, side in enumerate((first, second))
+    ]
+    if None in found:
         return None
-    colour, depth = (np.array(side, np.float64) for side in times)
+    colour, depth = (one[0] for one in found if one is not None)
     pairs = associate(colour, depth, DEPTH_NEAR_S)
     if not len(pairs[0]):
         raise InputError(
@@ -258,80 +260,37 @@ def _paired_by_time(
     return [[side[k] for k in chosen] for side, chosen in zip(files, pairs, strict=True)], pairing
 
 
-def _find_times(folder: Path, files: list[Path]) -> NDArray[np.float64]:
+def _find_times(folder: Path, files: list[Path]) -> tuple[list[float], Timing]:
+    """Find the times of images in seconds, in the order of the images."""
     for place in (folder, folder.parent):
         for name in _TIME_FILES:
             if (place / name).is_file():
                 return _times_of_file(place / name, len(files))
-    readers: tuple[Callable[[Path], float | None], ...] = (_time_of_name, _time_of_exif)
-    for time_of in readers:
-        if time_of(files[0]) is not None:
-            times = [time_of(path) for path in files]
-            missing = next((p for p, t in zip(files, times, strict=True) if t is None), None)
-            if missing is not None:
-                raise InputError(f"{missing}: has no time, unlike {files[0].name}; give --fps.")
-            return np.array(times, np.float64)
+    stems = [path.stem for path in files]
+    named = [stem for stem in stems if number_of(stem) is not None]
+    if (found := times_of_names(named, folder)) is not None:
+        if len(named) < len(files):
+            odd = next(path for path in files if path.stem not in named)
+            raise InputError(f"{odd}: has no time, unlike {named[0]}; give --fps.")
+        times, remarks = found
+        return times.tolist(), Timing(str(folder), remarks)
+    taken = [_time_of_exif(path) for path in files] if _time_of_exif(files[0]) is not None else []
+    if None in taken:
+        odd = files[taken.index(None)]
+        raise InputError(f"{odd}: has no time, unlike {files[0].name}; give --fps.")
+    if taken:
+        return [time for time in taken if time is not None], Timing(str(folder))
     raise InputError(
         f"{folder}: the images have no time stamps (no {' or '.join(_TIME_FILES)}, none in their "
         "names or EXIF); give --fps."
     )
 
 
-def _times_of_file(path: Path, n: int) -> NDArray[np.float64]:
-    times = read_times(path)
+def _times_of_file(path: Path, n: int) -> tuple[list[float], Timing]:
+    times, timing = times_of_list(path, _FIX)
     if len(times) != n:
         raise InputError(f"{path}: {len(times)} times for {n} images; write one line per image.")
-    if n > 1 and (interval := float(np.median(np.diff(times)))) > _LONGEST_INTERVAL_S:
-        raise InputError(
-            f"{path}: the images are {interval:g} s apart, as if the times were in milliseconds or "
-            "nanoseconds; write seconds, or give --fps."
-        )
-    return times
-
-
-def read_times(path: Path) -> NDArray[np.float64]:
-    """Read a list with one time per line: a number of seconds, or a date and time (ISO 8601).
-
-    Returns:
-        ``(N,)`` float64 seconds. Dates become seconds since 1970.
-
-    Raises:
-        InputError: the file is missing, empty or malformed.
-    """
-    times = []
-    try:
-        for line in path.read_text().splitlines():
-            if line.strip() and not line.startswith("#"):
-                times.append(seconds_of_date(line.strip()))
-    except (OSError, ValueError):  # no list of dates
-        times = []
-    return np.array(times) if times else read_table(path, (1,), "a time in seconds")[:, 0]
-
-
-def seconds_of_date(text: str) -> float:
-    """Convert a date and time of ISO 8601 to seconds since 1970, exact to a microsecond.
-
-    Without a time zone, the time is taken for UTC.
-
-    Raises:
-        ValueError: the text is not a date with a time.
-    """
-    time = datetime.fromisoformat(text)
-    if ":" not in text:  # fromisoformat also accepts numbers such as 20110926
-        raise ValueError(text)
-    return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
-
-
-def _time_of_name(path: Path) -> float | None:
-    """Read the time in a file name as seconds since 1970; None if the name is not a time."""
-    if re.fullmatch(r"\d+\.\d+", path.stem):
-        return float(path.stem)
-    if path.stem.isdecimal():
-        number = int(path.stem)
-        for least, per_second in _UNITS:
-            if number >= least:
-                return number / per_second
-    return None
+    return times, timing
 
 
 def _time_of_exif(path: Path) -> float | None:

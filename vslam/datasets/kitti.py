@@ -24,8 +24,9 @@ from vslam.camera import Camera
 from vslam.datasets.frames import Source
 from vslam.datasets.image_files import checked_files, list_images, select_frames
 from vslam.datasets.rectified import rectified
+from vslam.datasets.times import FIX_LIST, ordered_list, times_of_list
 from vslam.errors import InputError, UnreadableImageError
-from vslam.trajectory import read_kitti_poses, read_table
+from vslam.trajectory import read_kitti_poses
 
 _HOME = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php"
 _FIX = "take calib.txt of this sequence from KITTI's calibration files"
@@ -72,15 +73,18 @@ def open_kitti(
             f"{folder}: no images in image_0 and image_1, or in image_2 and image_3; download the "
             f"grayscale images (22 GB) from {_HOME}."
         )
-    chosen = select_frames(folder, len(stems), start, every, max_frames)
+    path = folder / "times.txt"
+    rows, timing = times_of_list(path, FIX_LIST)
+    of_images = [rows[k] for k in row_numbers(path, stems, len(rows))]
+    times, kept = ordered_list(of_images, timing, FIX_LIST)
+    selected = select_frames(folder, len(kept), start, every, max_frames)
+    chosen = kept[selected]
     sides = files_of_frames(places, listed, [stems[k] for k in chosen])
-    times = _read_times(folder / "times.txt")
-    frames = row_numbers(folder / "times.txt", stems, len(times))[chosen]
-    truth = _read_ground_truth(base / "poses" / f"{name}.txt", stems, len(times), chosen)
+    truth = _read_ground_truth(base / "poses" / f"{name}.txt", stems, len(rows), chosen)
     own = folder / "calib.txt"
     if truth is not None and cameras[0] != 0:  # the poses are those of camera 0
         truth[:, :3, 3] += truth[:, :3, :3] @ _centre(own, cameras[0])
-    images = checked_files("kitti", name, times[frames], truth, sides)
+    images = checked_files("kitti", name, np.array(times)[selected], truth, sides, timing=timing)
     left, *right = (f"{width}x{height}" for width, height in images.sizes)
     if right and right[0] != left:
         raise UnreadableImageError(
@@ -97,6 +101,7 @@ def open_kitti(
         camera=read_calibration(own, width=width, height=height, cameras=cameras),
         stored=images.stored,
         ground_truth=images.ground_truth,
+        timing=timing,
     )
 
 
@@ -262,16 +267,6 @@ def files_of_frames(
             f"images, and {len(sides[0].keys() & sides[1].keys())} frames have both; {fix}."
         )
     return [tuple(side[stem] for stem in stems) for side in sides]
-
-
-def _read_times(path: Path) -> NDArray[np.float64]:
-    times = read_table(path, (1,), "a time in seconds")[:, 0]
-    if (bad := np.flatnonzero(np.diff(times) <= 0)).size:
-        raise InputError(
-            f"{path}: time {bad[0] + 2} is not later than the one before it; "
-            "take times.txt of this sequence from KITTI's calibration files."
-        )
-    return times
 
 
 def row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]:

@@ -23,9 +23,9 @@ from vslam.calibration.formats import Size, read_kitti_raw
 from vslam.calibration.models import Calibration
 from vslam.datasets.frames import Source
 from vslam.datasets.image_files import checked_files, find_sequence, select_frames
-from vslam.datasets.image_folders import read_times
 from vslam.datasets.kitti import files_of_frames, find_cameras, row_numbers
 from vslam.datasets.rectified import rectified
+from vslam.datasets.times import FIX_LIST, ordered_list, times_of_list
 from vslam.errors import InputError
 
 _CALIBRATION = "calib_cam_to_cam.txt"
@@ -70,14 +70,14 @@ def open_kitti_raw(
     stems = sorted(set().union(*listed))
     if not stems:
         raise InputError(f"{places[0]}: no images in this folder; unpack the images of the drive.")
-    chosen = select_frames(folder, len(stems), start, every, max_frames)
-    sides = files_of_frames(places, listed, [stems[k] for k in chosen])
     path = places[0].parent / "timestamps.txt"
-    times = read_times(path)
-    times = times[row_numbers(path, stems, len(times))[chosen]]
-    if (np.diff(times) <= 0).any():
-        raise InputError(f"{path}: the times do not increase; give the list of this drive.")
-    images = checked_files("kitti_raw", folder.resolve().name, times, None, sides)
+    rows, timing = times_of_list(path, FIX_LIST)
+    of_images = [rows[k] for k in row_numbers(path, stems, len(rows))]
+    times, kept = ordered_list(of_images, timing, FIX_LIST)
+    selected = select_frames(folder, len(kept), start, every, max_frames)
+    sides = files_of_frames(places, listed, [stems[k] for k in kept[selected]])
+    name = folder.resolve().name
+    images = checked_files("kitti_raw", name, np.array(times)[selected], None, sides, timing=timing)
     return rectified(images, _calibration(folder, calib, images.sizes[0], cameras))
 
 

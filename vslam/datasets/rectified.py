@@ -51,6 +51,7 @@ def rectified(raw: RawSource, calibration: Calibration) -> Source:
         live=raw.live,
         ground_truth=T_wc,
         pairing=raw.pairing,
+        timing=raw.timing,
         rectify_mask=rectification.left_depth,
     )
 

@@ -29,6 +29,7 @@ from vslam.datasets.image_files import (
     select_frames,
 )
 from vslam.datasets.rectified import rectified
+from vslam.datasets.times import FIX_LIST, UNITS, Timing, ordered_list, unit_of_list
 from vslam.errors import InputError
 from vslam.trajectory import read_trajectory
 
@@ -88,12 +89,13 @@ def open_tum(
             f"{root}: holds no data in TUM's RGB-D layout (no rgb.txt); download a sequence from "
             f"{_HOME}, unpack it and give its folder with --data."
         )
-    times, colour_files = _read_list(folder / "rgb.txt")
+    times, colour_files, timing = _read_list(folder / "rgb.txt")
     frames = partners = np.arange(len(times))
     depth_files: list[Path] = []
     pairing = None
     if not monocular:
-        depth_times, depth_files = _read_list(folder / "depth.txt")
+        depth_times, depth_files, depth_timing = _read_list(folder / "depth.txt")
+        timing.remarks.extend(depth_timing.warnings())
         frames, partners = associate(times, depth_times, DEPTH_NEAR_S)
         if not len(frames):
             raise InputError(
@@ -115,11 +117,11 @@ def open_tum(
         poses_at(truth_file, read_trajectory(truth_file), times) if truth_file.is_file() else None
     )
     if monocular:
-        raw = checked_files("tum", found, times, truth, [colour])
+        raw = checked_files("tum", found, times, truth, [colour], timing=timing)
     else:
         depth = tuple(depth_files[k] for k in partners[chosen])
         scale = depth_scale or calibration.depth_scale or _DEPTH_SCALE
-        raw = checked_files("tum", found, times, truth, [colour, depth], scale, pairing)
+        raw = checked_files("tum", found, times, truth, [colour, depth], scale, pairing, timing)
     return rectified(raw, calibration)
 
 
@@ -128,7 +130,7 @@ def is_tum(folder: Path) -> bool:
     return (folder / "rgb.txt").is_file()
 
 
-def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
+def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path], Timing]:
     """Read the times in seconds and the files of images from ``rgb.txt`` or ``depth.txt``."""
 
     def parsed(line: str) -> tuple[float, str]:
@@ -138,8 +140,10 @@ def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
         return float(time), name.strip()
 
     instead = "run on the colour images with --sensor mono" if path.stem == "depth" else ""
-    times, names = read_image_list(path, parsed, "a time in seconds", instead)
-    return np.array(times), [path.parent / name for name in names]
+    numbers, names = read_image_list(path, parsed, "a time in seconds", instead)
+    unit, timing = unit_of_list(numbers, path, "seconds", FIX_LIST)
+    times, kept = ordered_list([number / UNITS[unit] for number in numbers], timing, FIX_LIST)
+    return np.array(times), [path.parent / names[k] for k in kept], timing
 
 
 def _calibration(folder: Path, calib: Several[Path | str], size: tuple[int, int]) -> Calibration:

@@ -90,7 +90,7 @@ def test_only_selected_frames_are_checked(root):
 def test_other_image_formats(root, suffix):
     for side in "01":
         for path in (root / f"sequences/00/image_{side}").iterdir():
-            write_image(path.with_suffix(suffix))
+            write_image(path.with_suffix(suffix), seed=int(side))
             path.unlink()
     assert open_kitti(root, "00").read(0)[0].shape == (HEIGHT, WIDTH)
 

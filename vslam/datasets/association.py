@@ -23,6 +23,17 @@ _MAX_GAP_S = 0.15
 # Shares of images without a partner. Above the first share, a warning is shown. Above the second
 # share, `Pairing.is_poor` is true. In TUM's sequences, up to 7 % of the images have no partner.
 _FEW, _MANY = 0.01, 0.1
+# For the clocks of two cameras, in steps from frame to frame: largest difference between the times
+# of a pair, and largest difference that needs no further evidence. The nearest wrong partner of a
+# frame is at least twice as far away.
+_SAME_FRAME = 0.3
+_EXACT = 0.02
+_FIRST = 40  # number of frames at the start from which offsets between the clocks are tried
+# The offset between two clocks is clear if all others leave differences that are this many times as
+# large. Offsets count if they pair at least this share of the frames.
+_CLEAR, _SHARE = 5.0, 0.8
+_CLOCKS_DIFFER_S = 0.005  # smallest difference between the clocks that is reported
+_ROUNDING = 1e-4  # differences that come from rounded times, in steps
 
 
 def associate(
@@ -56,6 +67,102 @@ def associate(
     return pairs[:, 0], pairs[:, 1]
 
 
+@dataclass(frozen=True)
+class ClockPairs:
+    """Pairs of frames of two cameras.
+
+    Attributes:
+        first, second: ``(P,)`` int64 increasing indices of the frames of each pair.
+        offset: constant by which the times of the second camera are later.
+        within: upper limit of the remaining difference between the times of a pair, in the same
+            unit. It is 0 if the frames were not paired by numbers or times.
+    """
+
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    offset: float = 0.0
+    within: float = 0.0
+
+
+def pair_clocks(
+    first: NDArray[np.float64], second: NDArray[np.float64], most: float = np.inf
+) -> ClockPairs | None:
+    """Pair the frames of two cameras by their times or frame numbers.
+
+    The clocks of the cameras may differ by a constant. After this constant has been subtracted, the
+    frames of a pair differ by less than 0.3 steps from frame to frame. A frame without a partner is
+    therefore never paired with a neighbour of its partner.
+
+    The constant is the median difference between frames that are nearest to each other if this is
+    less than 0.3 steps and no other constant fits much better. Otherwise, it is the constant that
+    fits much better than all others.
+
+    Args:
+        first: ``(N,)`` increasing times in any unit, with N at least 1.
+        second: ``(M,)`` increasing times in the same unit, with M at least 1.
+        most: upper limit of the remaining difference between the times of a pair.
+
+    Returns:
+        None if the times do not tell which frames belong together.
+    """
+    steps = [float(np.median(np.diff(times))) for times in (first, second) if len(times) > 1]
+    step = min(steps, default=np.inf)
+    within = min(_SAME_FRAME * step, most)
+    apart = _to_nearest(first, second)
+    apart = apart[np.abs(apart) < 0.5 * step]
+    near = float(np.median(apart)) if len(apart) else np.inf
+    offset = near if abs(near) < _SAME_FRAME * step else None
+    if offset is None or _fit(first, second, offset, within)[2] > _EXACT * step:
+        clear = _clear_offset(first, second, step, within)
+        offset = offset if clear is None else clear
+    if offset is not None:
+        pairs = associate(first + offset, second, within)
+        return ClockPairs(*pairs, offset, within) if len(pairs[0]) else None
+    return None
+
+
+def _to_nearest(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the ``(N,)`` differences from each time to the nearest time of the other list."""
+    after = np.searchsorted(second, first)
+    later = second[after.clip(max=len(second) - 1)] - first
+    earlier = second[(after - 1).clip(0)] - first
+    return np.where(np.abs(earlier) < np.abs(later), earlier, later)
+
+
+def _fit(
+    first: NDArray[np.float64], second: NDArray[np.float64], offset: float, within: float
+) -> tuple[int, float, float]:
+    """Improve an offset between two clocks by the median of the differences that remain.
+
+    Returns:
+        The number of frames with a partner, the offset, and the 90th percentile of the differences
+        that remain.
+    """
+    apart = _to_nearest(first + offset, second)
+    apart = apart[np.abs(apart) < within]
+    if not len(apart):
+        return 0, offset, np.inf
+    middle = float(np.median(apart))
+    return len(apart), offset + middle, float(np.percentile(np.abs(apart - middle), 90))
+
+
+def _clear_offset(
+    first: NDArray[np.float64], second: NDArray[np.float64], step: float, within: float
+) -> float | None:
+    """Find the offset between two clocks that fits much better than all others; None without it."""
+    tried = (second[:_FIRST, None] - first[None, :_FIRST]).ravel()
+    cells = np.unique(np.rint(tried / within), return_index=True)[1]
+    fits = [_fit(first, second, float(tried[k]), within) for k in cells]
+    most = max(n for n, _, _ in fits)
+    fits = [fit for fit in fits if fit[0] >= max(2, _SHARE * most)]
+    if not fits:
+        return None
+    _, offset, spread = min(fits, key=lambda fit: fit[2])
+    others = [fit[2] for fit in fits if abs(fit[1] - offset) > 0.5 * step]
+    least = _CLEAR * max(spread, _ROUNDING * step)
+    return offset if all(other > least for other in others) else None
+
+
 @dataclass
 class Pairing:
     """Counts how many images a reader pairs by time, and how many images it leaves out.
@@ -66,11 +173,16 @@ class Pairing:
     Attributes:
         source: file or folder of the images, for messages.
         partner: what the second image of a pair is called in messages, such as ``depth image``.
-        within_s: largest difference in seconds between the two times of a pair.
+        within_s: largest difference in seconds between the two times of a pair. 0 if the images are
+            paired by the numbers or times in their names.
         fix: what the user can do if images are left out.
         n_pairs: number of pairs.
         left_out: times in seconds of the images without a partner.
         seconds: times in seconds of all possible partners, whether they are paired or not.
+        n_alone: number of partners that are left out because they have no image. Partners that are
+            expected to be more frequent than images are not counted.
+        late_s: constant in seconds by which the clock of the partners is late. It has been
+            subtracted before the images were paired.
     """
 
     source: Path
@@ -80,14 +192,25 @@ class Pairing:
     n_pairs: int = 0
     left_out: list[float] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
+    n_alone: int = 0
+    late_s: float = 0.0
 
     @property
     def measured(self) -> str:
         """Text that says how many images are left out, and why."""
+        said = self._images_left_out()
+        if self.n_alone:
+            all_partners = self.n_alone + self.n_pairs
+            said += f"; of the {self.partner}s, {self.n_alone} of {all_partners} are left out"
+        return said
+
+    def _images_left_out(self) -> str:
         n = len(self.left_out)
         said = f"{n} of {n + self.n_pairs} images are left out"
         if not n:
             return said
+        if not self.within_s:
+            return f"{said} because no {self.partner} has the same number or time in its name"
         apart = self._seconds_to_nearest_partner()
         far = apart[apart > self.within_s]
         alone = f"because no {self.partner} is within {1e3 * self.within_s:g} ms of them"
@@ -106,10 +229,20 @@ class Pairing:
         return len(self.left_out) > _MANY * (len(self.left_out) + self.n_pairs)
 
     def warnings(self) -> list[str]:
-        """Return a warning if more than a hundredth of the images are left out."""
-        if len(self.left_out) <= _FEW * (len(self.left_out) + self.n_pairs):
-            return []
-        return [f"{self.source}: {self.measured}; {self.fix}."]
+        """Return warnings if more than a hundredth of the images are left out, or if the clocks of
+        the two cameras differ."""
+        said = []
+        n = max(len(self.left_out), self.n_alone)
+        if n > _FEW * (n + self.n_pairs):
+            said.append(f"{self.source}: {self.measured}; {self.fix}.")
+        if abs(self.late_s) > _CLOCKS_DIFFER_S:
+            side = "later" if self.late_s > 0 else "earlier"
+            said.append(
+                f"{self.source}: the times of the {self.partner}s are {abs(self.late_s):.3g} s "
+                f"{side} than those of their images, which were paired as if only the clocks "
+                "differed; use one clock for both cameras."
+            )
+        return said
 
     def count(
         self, times: NDArray[np.float64], paired: NDArray[np.int64], seconds: NDArray[np.float64]
@@ -124,6 +257,12 @@ class Pairing:
         self.n_pairs = len(paired)
         self.left_out = np.delete(times, paired).tolist()
         self.seconds = seconds.tolist()
+
+    def count_names(self, pairs: ClockPairs, n_images: int, n_partners: int) -> None:
+        """Count images that were paired by their names. The index of an image replaces its time."""
+        self.n_pairs = len(pairs.first)
+        self.left_out = np.delete(np.arange(float(n_images)), pairs.first).tolist()
+        self.n_alone = n_partners - self.n_pairs
 
     def restart(self) -> None:
         """Reset all counts, before a stream is read again from its beginning."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
-from vslam.datasets.association import Pairing, associate, poses_at
+from vslam.datasets.association import Pairing, pair_clocks, poses_at
 from vslam.datasets.frames import RawSource, Source
 from vslam.datasets.image_files import (
     checked_files,
@@ -58,9 +58,9 @@ def open_euroc(
 ) -> Source:
     """Open a sequence of EuRoC. Its images are rectified when they are read.
 
-    A frame consists of a left image and the right image that is nearest in time. Left images
-    without a right image within 5 ms are skipped. The ground truth is interpolated at the times of
-    the frames.
+    A frame consists of a left and a right image whose times differ by at most 5 ms, apart from a
+    constant difference between the clocks of the cameras. Images without a partner are left out.
+    The ground truth is interpolated at the times of the frames.
 
     Args:
         root: folder of the sequence, or a folder that contains several sequences.
@@ -133,7 +133,7 @@ def _select(
     for other in others:
         timing.remarks.extend(other.warnings())
     frames = _pair(cameras, times)
-    pairing = None if monocular else _pairing(base, times, frames[:, 0])
+    pairing = None if monocular else _pairing(base, times, frames)
     chosen = frames[select_frames(base, len(frames), start, every, max_frames)]
     files = [
         tuple(camera / "data" / names[k] for k in rows)
@@ -180,23 +180,23 @@ def _pair(cameras: list[Path], times: list[NDArray[np.int64]]) -> NDArray[np.int
     if len(times) == 1:
         return np.arange(len(times[0]))[:, None]
     left, right = ((side - times[0][0]).astype(np.float64) for side in times)  # exact nanoseconds
-    pairs = np.column_stack(associate(left, right, _MOST_APART_NS + 1))
-    if not len(pairs):
+    pairs = pair_clocks(left, right, _MOST_APART_NS + 1)
+    if pairs is None:
         raise InputError(
             f"{cameras[1]}: none of its {len(right)} images has the time of an image in "
-            f"{cameras[0]}; take both cameras from one sequence."
+            f"{cameras[0]}, and the clocks of the cameras do not differ by a clear constant; take "
+            "both cameras from one sequence, or run with --sensor mono."
         )
-    return pairs
+    return np.column_stack((pairs.first, pairs.second))
 
 
-def _pairing(base: Path, times: list[NDArray[np.int64]], paired: NDArray[np.int64]) -> Pairing:
-    fix = (
-        "correct the times in cam1/data.csv if they are all late, or run on the left camera alone "
-        "with --sensor mono"
-    )
+def _pairing(base: Path, times: list[NDArray[np.int64]], frames: NDArray[np.int64]) -> Pairing:
+    fix = "restore the missing images, or run on the left camera alone with --sensor mono"
     pairing = Pairing(base, "right image", _MOST_APART_NS * 1e-9, fix)
     left, right = (1e-9 * (side - times[0][0]) for side in times)
-    pairing.count(left, paired, right)
+    pairing.late_s = float(np.median(right[frames[:, 1]] - left[frames[:, 0]]))
+    pairing.count(left, frames[:, 0], right - pairing.late_s)
+    pairing.n_alone = len(right) - len(frames)
     return pairing
 
 

@@ -1,11 +1,12 @@
 """Reads folders of images: one folder, or two folders for stereo pairs or images with depth.
 
 The two folders of a pair have a common parent folder and are named as in `PAIRS` or `DEPTH_PAIRS`.
-Otherwise, the second folder is given by ``--right`` or ``--depth``.
+Otherwise, the second folder is given by ``--right`` or ``--depth``. All images may also be in one
+folder if their names tell them apart, such as ``left_0001`` and ``right_0001``.
 
-Images with the same name form a pair. If the two folders have no name in common but the same number
-of images, their images are paired in order. If the names of images and depth images are times, the
-images are paired by time. The times of a pair are then less than 20 ms apart.
+Images with the same name form a pair. Otherwise, images are paired by the numbers or times in their
+names (`vslam.datasets.names.pair_names`). If the names of images and depth images are times, the
+times of a pair are less than 20 ms apart. Images without a partner are left out and counted.
 
 The times of the images are taken from the first of these sources that exists:
 
@@ -21,6 +22,8 @@ The times of the images are taken from the first of these sources that exists:
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -36,6 +39,7 @@ from vslam.datasets.image_files import (
     list_images,
     select_frames,
 )
+from vslam.datasets.names import group_names, pair_names, role_of, sides_by_name
 from vslam.datasets.times import (
     Timing,
     number_of,
@@ -56,6 +60,8 @@ PAIRS = (
     ("image_02/data", "image_03/data"),
 )
 DEPTH_PAIRS = (("rgb", "depth"), ("color", "depth"), ("colour", "depth"), ("image", "depth"))
+_CLOCKS_DIFFER = 0.2  # least difference between two clocks that is reported, in `ClockPairs.within`
+_EXAMINED = 8  # number of images whose headers are compared
 _TIME_FILES = ("times.txt", "timestamps.txt")
 _EXIF = 0x8769  # tags of EXIF 2.32
 _DATE_TIME_ORIGINAL, _SUB_SEC_TIME_ORIGINAL = 0x9003, 0x9291
@@ -143,38 +149,53 @@ def open_images(
     folder = Path(folder)
     right = None if right is None else Path(right)
     depth = None if depth is None else Path(depth)
-    places, is_depth = _find_sides(folder, right, depth, sensor)
-    listed = [_sorted_images(place) for place in places]
-    files, pairing = _paired(listed, places, by_time=is_depth)
+    places, images, is_depth = _find_sides(folder, right, depth, sensor)
+    listed = [_sorted_images(side) for side in images]
+    _check_kinds(places, listed if not is_depth else listed[:1])
+    pairs, pairing = _paired(listed, places, depth=is_depth)
+    first = list(listed[0].values())
     if fps is not None:
-        found, timing = [k / fps for k in range(len(files[0]))], Timing(str(places[0]))
+        found, timing = [k / fps for k in range(len(first))], Timing(str(places[0]))
     else:
-        found, timing = _find_times(places[0], files[0])
-    times, kept = ordered_list(found, timing, _FIX)
+        found, timing = _find_times(places[0], first)
+    times, kept = ordered_list([found[k] for k in pairs[0]], timing, _FIX)
     selected = select_frames(folder, len(kept), start, every, max_frames)
-    sides = tuple(tuple(side[k] for k in kept[selected]) for side in files)
+    files = [list(side.values()) for side in listed]
+    sides = tuple(
+        tuple(side[k] for k in rows[kept[selected]])
+        for side, rows in zip(files, pairs, strict=True)
+    )
     size, name = image_size(sides[0][0]), folder.resolve().name
     return ImageFolders(name, np.array(times)[selected], sides, is_depth, size, pairing, timing)
 
 
 def _find_sides(
     folder: Path, right: Path | None, depth: Path | None, sensor: str | None
-) -> tuple[list[Path], bool]:
-    """Return the folders of the images, and whether the second folder contains depth images."""
+) -> tuple[list[Path], list[dict[str, Path]], bool]:
+    """Return the folder and the images of each side, and whether the second side is depth."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give a folder of images with --data.")
     if right is not None and depth is not None:
         raise InputError(f"--depth {depth}: contradicts --right; leave one of them out.")
     for second in (right, depth):
         if second is not None:
-            return [folder, second], second is depth
+            if second.resolve() == folder.resolve():
+                raise InputError(
+                    f"--{'depth' if second is depth else 'right'} {second}: is also the folder of "
+                    "--data; give the folder of the other images, or leave the option out."
+                )
+            return [folder, second], [_images(folder), _images(second)], second is depth
     wanted = [(names, False) for names in PAIRS if sensor != "rgbd"]
     wanted += [(names, True) for names in DEPTH_PAIRS if sensor != "stereo"]
     n = 1 if sensor == "mono" else 2
     for names, is_depth in wanted:
         pair = [folder / name for name in names[:n]]
-        if all(list_images(side) for side in pair):
-            return pair, is_depth and n == 2
+        if all(images := [list_images(side) for side in pair]):
+            return pair, images, is_depth and n == 2
+    together = list_images(folder)
+    if (found := sides_by_name(list(together), sensor)) is not None:
+        sides, is_depth = found
+        return [folder] * len(sides), [{k: together[k] for k in side} for side in sides], is_depth
     if sensor != "mono":
         kinds = {None: PAIRS + DEPTH_PAIRS[:1], "stereo": PAIRS, "rgbd": DEPTH_PAIRS}[sensor]
         pairs = ", ".join(" and ".join(names) for names in kinds)
@@ -184,7 +205,7 @@ def _find_sides(
             f"of the {first} images with --data and the other folder with {option}, or run with "
             "--sensor mono."
         )
-    return [folder], False
+    return [folder], [_images(folder)], False
 
 
 def _near_miss(folder: Path) -> str:
@@ -200,15 +221,18 @@ def _near_miss(folder: Path) -> str:
     return ""
 
 
-def _sorted_images(folder: Path) -> dict[str, Path]:
-    """List the images of a folder by stem, in the order in which they were taken.
+def _images(folder: Path) -> dict[str, Path]:
+    if images := list_images(folder):
+        return images
+    raise InputError(f"{folder}: no images in this folder; give another.")
+
+
+def _sorted_images(images: dict[str, Path]) -> dict[str, Path]:
+    """Sort images, which are listed by stem, by the order in which they were taken.
 
     If not all names are numbers, the images are sorted by the numbers in their names, so that 2
     comes before 10.
     """
-    images = list_images(folder)
-    if not images:
-        raise InputError(f"{folder}: no images in this folder; give another.")
 
     def by_number(stem: str) -> list[tuple[str, int]]:
         return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", stem)]
@@ -218,46 +242,130 @@ def _sorted_images(folder: Path) -> dict[str, Path]:
     return {stem: images[stem] for stem in ordered or sorted(images, key=by_number)}
 
 
-def _paired(
-    sides: list[dict[str, Path]], folders: list[Path], *, by_time: bool
-) -> tuple[list[list[Path]], Pairing | None]:
-    """Pair the files of two folders. Return the files of each folder in the order of the pairs."""
-    first, *rest = sides
-    for other in rest:
-        if first.keys() == other.keys():
-            return [[side[stem] for stem in first] for side in sides], None
-        if by_time and (pairs := _paired_by_time(first, other)) is not None:
-            return pairs
-        if len(other) != len(first) or first.keys() & other.keys():
+@dataclass(frozen=True)
+class _Kind:
+    """What the header and the name of an image file tell. A ``deep`` image has more than 8 bits.
+
+    ``second`` is ``right`` or ``depth`` if the name tells that the image is the second of a pair.
+    """
+
+    size: tuple[int, int]
+    colour: bool
+    deep: bool
+    second: str
+
+    def __str__(self) -> str:
+        colour, bits = "colour" if self.colour else "grey", 16 if self.deep else 8
+        return f"{self.size[0]}x{self.size[1]}, {colour}, {bits} bits"
+
+
+def _check_kinds(folders: list[Path], sides: list[dict[str, Path]]) -> None:
+    """Check that the images of a side are of one kind, and that two sides can be a stereo pair.
+
+    Only the headers of a few files are read. If all names are alike, images may differ in size and
+    colour: a run skips images of another size.
+    """
+    firsts: list[tuple[Path, _Kind]] = []
+    for images in sides:
+        groups = [names for names in group_names(list(images)).values() if len(names) > 1]
+        by_name = _kinds([images[names[0]] for names in groups[:_EXAMINED]])
+        first = _kinds(list(images.values())[:_EXAMINED])
+        found = _different(by_name, lambda kind: kind) or _different(first, lambda kind: kind.deep)
+        if found is not None:
             raise InputError(
-                f"{folders[1]}: {len(other)} images but {len(first)} in {folders[0]}, and "
-                f"{min(first.keys() ^ other.keys())} is in only one of them; remove the images "
-                "without a partner."
+                f"{found[0][0].parent}: {' and '.join(f'{p.name} ({k})' for p, k in found)} are "
+                "images of different kinds; move the images of each kind to a folder of their own."
             )
-    return [list(side.values()) for side in sides], None
+        firsts += first[:1]
+    if len(sides) == 2 and (found := _different(firsts, lambda kind: kind.deep)) is not None:
+        raise InputError(
+            f"{folders[1]}: {' and '.join(f'{p.name} ({k})' for p, k in found)} are not a stereo "
+            "pair; give depth images with --depth, and save stereo images with equal bits."
+        )
+
+
+def _different(
+    kinds: list[tuple[Path, _Kind]], part: Callable[[_Kind], object]
+) -> list[tuple[Path, _Kind]] | None:
+    """Return the first image, and the first image that differs from it; None if none differs."""
+    other = next((one for one in kinds if part(one[1]) != part(kinds[0][1])), None)
+    return None if other is None else [kinds[0], other]
+
+
+def _kinds(paths: list[Path]) -> list[tuple[Path, _Kind]]:
+    """Read the headers of image files. Files that Pillow cannot read are left out."""
+    from PIL import Image as PillowImage
+
+    found = []
+    for path in paths:
+        with suppress(Exception), PillowImage.open(path) as image:  # many kinds of errors
+            mode = image.mode
+            colour = mode not in ("1", "L", "LA", "F") and mode[0] != "I"
+            role = role_of(path.stem)
+            second = role if role in ("right", "depth") else ""
+            found.append((path, _Kind(image.size, colour, mode[0] in "IF", second)))
+    return found
+
+
+def _paired(
+    sides: list[dict[str, Path]], folders: list[Path], *, depth: bool
+) -> tuple[list[NDArray[np.int64]], Pairing | None]:
+    """Pair the images of two folders.
+
+    Returns:
+        The indices of the images of each folder, in the order of the pairs. The pairing is None if
+        there is only one folder, or if both folders contain the same names.
+    """
+    first, *rest = sides
+    if not rest or first.keys() == rest[0].keys():
+        at = [{stem: k for k, stem in enumerate(side)} for side in sides]
+        return [np.array([index[stem] for stem in first]) for index in at], None
+    times = [
+        time
+        for side, folder in zip(sides, folders, strict=True)
+        if (time := _times_of_names(list(side), folder)) is not None
+    ]
+    timed = len(times) == 2
+    if depth and timed:
+        return _paired_by_time(folders, *times)
+    seconds = (times[0].tolist(), times[1].tolist()) if timed else None
+    pairs = pair_names(list(first), list(rest[0]), seconds)
+    if pairs is None:
+        raise InputError(
+            f"{folders[1]}: the names of its {len(rest[0])} images and of the {len(first)} images "
+            f"in {folders[0]} do not tell which images were taken together; give the images of a "
+            "pair the same number."
+        )
+    fix = "restore the missing files, or run with --sensor mono"
+    pairing = Pairing(folders[0], "depth image" if depth else "right image", 0.0, fix)
+    pairing.count_names(pairs, len(first), len(rest[0]))
+    if timed and abs(pairs.offset) > _CLOCKS_DIFFER * pairs.within:
+        pairing.late_s = float(np.median(times[1][pairs.second] - times[0][pairs.first]))
+    return [pairs.first, pairs.second], pairing
+
+
+def _times_of_names(names: list[str], folder: Path) -> NDArray[np.float64] | None:
+    """Read names as ``(N,)`` times in seconds. None if they are no times, or if these are wrong."""
+    with suppress(InputError):
+        found = times_of_names(names, folder)
+        return None if found is None else found[0]
+    return None
 
 
 def _paired_by_time(
-    first: dict[str, Path], second: dict[str, Path]
-) -> tuple[list[list[Path]], Pairing] | None:
-    """Pair the files of two folders by the times in their names. None if a name is not a time."""
-    files = [list(side.values()) for side in (first, second)]
-    found = [
-        times_of_names(list(side), files[k][0].parent) for k, side in enumerate((first, second))
-    ]
-    if None in found:
-        return None
-    colour, depth = (one[0] for one in found if one is not None)
-    pairs = associate(colour, depth, DEPTH_NEAR_S)
+    folders: list[Path], images: NDArray[np.float64], depth: NDArray[np.float64]
+) -> tuple[list[NDArray[np.int64]], Pairing]:
+    """Pair images with depth images by the times in their names, in seconds."""
+    pairs = associate(images, depth, DEPTH_NEAR_S)
     if not len(pairs[0]):
         raise InputError(
-            f"{files[1][0].parent}: by the times in their names, no depth image is within 20 ms of "
-            "an image; give folders of one recording."
+            f"{folders[1]}: by the times in their names, no depth image is within 20 ms of an "
+            "image; give folders of one recording."
         )
     fix = "correct the names if the times of one folder are late, or run with --sensor mono"
-    pairing = Pairing(files[0][0].parent, "depth image", DEPTH_NEAR_S, fix)
-    pairing.count(colour, pairs[0], depth)
-    return [[side[k] for k in chosen] for side, chosen in zip(files, pairs, strict=True)], pairing
+    pairing = Pairing(folders[0], "depth image", DEPTH_NEAR_S, fix)
+    pairing.count(images, pairs[0], depth)
+    return list(pairs), pairing
 
 
 def _find_times(folder: Path, files: list[Path]) -> tuple[list[float], Timing]:

@@ -107,8 +107,8 @@ class Frame:
         timestamp: float = 0.0,
         image: NDArray[np.uint8] | None = None,
     ) -> Frame:
-        """Create a frame that is not tracked yet. Its pose is the identity, and its features have
-        no matches."""
+        """Create a frame that is not tracked yet. Its pose is that of the first frame of a drive,
+        and its features have no matches."""
         features, n = extracted.features, len(extracted.features)
         return cls(
             index=index,
@@ -120,7 +120,7 @@ class Frame:
             row_offset=extracted.row_offset,
             side=extracted.side,
             T_camera_left=camera.T_right_left if extracted.side == Side.RIGHT else np.eye(4),
-            T_cw=np.eye(4),
+            T_cw=inverse(camera.T_mounted_camera),
             landmark=np.full(n, -1, np.int32),
             xyz=np.full((n, 3), np.nan),
         )

@@ -8,6 +8,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.camera import Camera
 from vslam.features import Extracted, TrackingState, TrackResult, nearest_features
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
@@ -392,11 +393,12 @@ def result_of(
     is_keyframe: bool,
     stage_ms: dict[str, float],
     odometry: Odometry,
+    camera: Camera,
 ) -> TrackResult:
     return TrackResult(
         index=frame.index,
         timestamp=frame.timestamp,
-        T_wc=inverse(frame.T_cw),
+        T_wc=camera.as_mounted(inverse(frame.T_cw)),
         state=found.state,
         n_features=len(frame.features) if frame.source is None else 0,
         n_stereo=frame.n_stereo,

@@ -89,7 +89,14 @@ RIGS = {
     ),
     "fisheye": pair(FISHEYE, replace(FISHEYE, fx=195.0, cx=250.0)),
     "mixed": pair(replace(PINHOLE, distortion=RADTAN), FISHEYE),
+    "right one below": pair(
+        replace(PINHOLE, distortion=RADTAN[:4]),
+        replace(PINHOLE, fx=470.0, fy=471.0, cx=380.0, distortion=RADTAN[:5]),
+        (0.01, 0.5, -0.02, 0.01, -0.02, 0.015),
+    ),
+    "right one above": pair(FISHEYE, replace(FISHEYE, fx=195.0), (0.02, -0.5, 0.01, 0.01, 0, 0.02)),
 }
+TURNS = {"right one below": 1, "right one above": -1}
 
 
 @pytest.mark.slow
@@ -126,8 +133,41 @@ def test_no_pixel_of_a_rectified_image_is_black(rig):
     found = rectify(calibration)
     for model, remap in ((calibration.left, found.left), (calibration.right, found.right)):
         image = remap(np.full((model.height, model.width), 200, np.uint8))
-        assert image.shape == (calibration.left.height, calibration.left.width)
+        size = (calibration.left.height, calibration.left.width)
+        assert image.shape == (size[::-1] if rig in TURNS else size)
         assert (image == 200).all()
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_only_vertical_pairs_are_turned(rig):
+    """The mounted camera differs from the original one by the small rotation of rectification."""
+    found = rectify(RIGS[rig])
+    assert found.camera.quarter_turns == TURNS.get(rig, 0)
+    R = found.R_left_rectified @ found.camera.T_mounted_camera[:3, :3].T
+    assert np.degrees(np.arccos((np.trace(R) - 1) / 2)) < 5
+
+
+@pytest.mark.parametrize("turns", [1, -1])
+def test_a_vertical_pair_without_distortion_is_turned_exactly(turns):
+    one = CameraModel(240.0, 240.0, 250.0, 70.0, 480, 160)
+    shift = np.eye(4)
+    shift[1, 3] = turns * 0.12
+    found = rectify(Calibration(one, one, shift))
+    image = np.random.default_rng(0).integers(0, 256, (160, 480)).astype(np.uint8)
+    for remap in (found.left, found.right, found.left_depth):
+        assert np.array_equal(remap(image), np.rot90(image, turns))
+    camera = found.camera
+    assert (camera.width, camera.height, camera.baseline) == (160, 480, 0.12)
+    np.testing.assert_allclose([camera.fx, camera.fy], 240.0)
+    point = np.array([[0.3, -0.2, 2.0]])
+    turned = point @ found.R_left_rectified
+    at = np.rint(camera.project(turned)[0, :2]).astype(int)
+    seen = np.zeros((160, 480), np.uint8)
+    x, y = np.rint(project(one, point)[0]).astype(int)
+    seen[y, x] = 1
+    assert found.left(seen)[at[1], at[0]] == 1
+    np.testing.assert_allclose(found.R_left_rectified, camera.T_mounted_camera[:3, :3])
+    assert rectify(Calibration(one, one, shift).left_alone()).camera.quarter_turns == 0
 
 
 def test_most_of_the_view_is_kept():
@@ -171,7 +211,7 @@ def test_depth_is_undistorted_by_the_nearest_pixel():
         ((-0.3, 0, 0, 0, 0, 0), "to the left of the left one; swap"),
         ((0, 0, 0, 0, 0, 0), "baseline is 0 m"),
         ((120.0, 0, 0, 0, 0, 0), "are 120 m apart, probably because .* in millimetres"),
-        ((0, 0.3, 0, 0, 0, 0), "are not side by side or look in different directions"),
+        ((0.05, 0, 0.3, 0, 0, 0), "are one in front of the other or look in different directions"),
         ((0.3, 0, 0, 0, 3.14, 0), "turned by"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -196,6 +197,16 @@ def test_a_radial_tangential_pair(tmp_path, write):
 @pytest.mark.parametrize("write", FISHEYE, ids=lambda f: f.__name__)
 def test_a_fisheye_pair(tmp_path, write):
     same(read_calibration(write(tmp_path, ROUND), SIZE), ROUND)
+
+
+@pytest.mark.parametrize("down", [0.11, -0.11])
+@pytest.mark.parametrize("write", RADIAL, ids=lambda f: f.__name__)
+def test_a_pair_of_cameras_one_above_the_other(tmp_path, monkeypatch, write, down):
+    T = se3_exp(np.array([0.001, down, -0.0005, 0.001, 0.012, -0.014]))
+    monkeypatch.setattr(sys.modules[__name__], "T_LEFT_RIGHT", T)
+    found = read_calibration(write(tmp_path, (LEFT, RIGHT)), SIZE)
+    same(found, (LEFT, RIGHT))
+    assert rectify(found).camera.quarter_turns == np.sign(down)
 
 
 def complaint(given: list[Path]) -> str:

@@ -50,10 +50,16 @@ class Camera:
             depth image holds the depth of each pixel of the left image.
         right_delay: seconds from the exposure of the left image to the exposure of the right image.
             It is negative if the right image is exposed first.
+        quarter_turns: 1 or -1 if the images of two cameras, one above the other, were turned by 90
+            degrees, so that the cameras are side by side. 1 means that the right camera is the
+            lower one. 0 if the images were not turned. The *camera as mounted* is the left camera
+            before its images were turned. Trajectories contain its poses, and its first pose is the
+            world frame.
 
     Raises:
-        ValueError: a size or focal length is not positive, the baseline is negative, or the
-            principal point is farther from the image than the image is wide or high.
+        ValueError: a size or focal length is not positive, the baseline is negative, the principal
+            point is farther from the image than the image is wide or high, or ``quarter_turns`` is
+            not -1, 0 or 1.
     """
 
     fx: float
@@ -65,8 +71,11 @@ class Camera:
     height: int
     depth: bool = False
     right_delay: float = 0.0
+    quarter_turns: int = 0
 
     def __post_init__(self) -> None:
+        if self.quarter_turns not in (-1, 0, 1):
+            raise ValueError(f"quarter_turns is {self.quarter_turns} but must be -1, 0 or 1")
         size = f"{self.width}x{self.height}"
         if not (self.width > 0 and self.height > 0):
             raise ValueError(f"the image size {size} must be positive")
@@ -106,6 +115,19 @@ class Camera:
         T = np.eye(4)
         T[0, 3] = -self.baseline
         return T
+
+    @property
+    def T_mounted_camera(self) -> NDArray[np.float64]:
+        """``(4, 4)`` rotation from the frame of the left camera to that of the camera as
+        mounted."""
+        T, s = np.eye(4), self.quarter_turns
+        if s:
+            T[:2, :2] = [[0, -s], [s, 0]]
+        return T
+
+    def as_mounted(self, T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ``(..., 4, 4)`` poses of the camera as mounted from poses of the left camera."""
+        return T_wc @ self.T_mounted_camera.T if self.quarter_turns else T_wc
 
     @property
     def bf(self) -> float:
@@ -205,7 +227,7 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
 
 def same_camera(one: Camera, other: Camera) -> bool:
     """Return whether two cameras are equal, apart from rounding errors of calibration files."""
-    shapes = [(c.width, c.height, c.depth, c.monocular) for c in (one, other)]
+    shapes = [(c.width, c.height, c.depth, c.monocular, c.quarter_turns) for c in (one, other)]
     first, second = ([*c.intrinsics, c.right_delay] for c in (one, other))
     return shapes[0] == shapes[1] and bool(np.allclose(first, second, rtol=1e-6))
 

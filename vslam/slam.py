@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from vslam.mapping import Mapper
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.modes import MapBuilding, Mode
-from vslam.odometry import Odometry
+from vslam.odometry import Odometry, adjoint
 from vslam.session import Session, open_map
 from vslam.trajectory import Trajectory
 from vslam.workers import Workers
@@ -292,16 +293,22 @@ class Slam:
             if found is not tracked:
                 clock.lap("relocalise")
             placed = self._record_pose(frame, found, T_predicted)
-            on_pose(result_of(frame, found, False, dict(clock.ms), self._odometry))
+            on_pose(self._result(frame, found, False, dict(clock.ms)))
             is_keyframe = self._update_map(placed, found)
         else:
             found = self._begin_map(frame, clock)
             is_keyframe = not found.is_lost
-            on_pose(result_of(frame, found, is_keyframe, dict(clock.ms), self._odometry))
+            on_pose(self._result(frame, found, is_keyframe, dict(clock.ms)))
         if is_keyframe:
             self._odometry.keyframe()
         clock.lap("keyframe")
-        return result_of(frame, found, is_keyframe, clock.ms, self._odometry)
+        return self._result(frame, found, is_keyframe, clock.ms)
+
+    def _result(
+        self, frame: Frame, found: Found, is_keyframe: bool, stage_ms: dict[str, float]
+    ) -> TrackResult:
+        camera, odometry = self.context.camera, self._odometry
+        return result_of(frame, found, is_keyframe, stage_ms, odometry, camera)
 
     def _begin_map(self, frame: Frame, clock: StageClock) -> Found:
         self.rig.extract(frame, self._tracker.twist)
@@ -372,7 +379,7 @@ class Slam:
         if self._mapper.n_keyframes and not dropped:
             self._tracker.lose()
         found = Found(TrackingState.DROPPED if dropped else TrackingState.LOST)
-        return result_of(frame, found, False, {}, self._odometry)
+        return self._result(frame, found, False, {})
 
     def _follow(
         self,
@@ -394,6 +401,13 @@ class Slam:
         if len(frames):
             T_now_last = T_cw @ inverse(frames.pose(-1))
             elapsed = frame.timestamp - frames.timestamp(-1)
+        camera = self.context.camera
+        if camera.quarter_turns:  # the odometry is that of the camera as mounted
+            T = camera.T_mounted_camera
+            A, R = adjoint(T), T[:3, :3]
+            T_now_last = T @ T_now_last @ T.T
+            covariance = None if covariance is None else A @ covariance @ A.T
+            of_offset = None if of_offset is None else A @ of_offset @ R.T
         self._odometry.move(T_now_last, elapsed, covariance, of_offset)
 
     def resume_odometry(self, last: TrackResult) -> None:
@@ -469,11 +483,15 @@ class Slam:
 
     def trajectory(self) -> Trajectory:
         """Return the pose of every frame. The poses of lost frames are interpolated."""
-        return self._mapper.trajectory()
+        return self._as_mounted(self._mapper.trajectory())
 
     def keyframe_trajectory(self) -> Trajectory:
         """Return the poses of the keyframes of this drive, without culled keyframes."""
-        return keyframe_trajectory(self.map)
+        return self._as_mounted(keyframe_trajectory(self.map))
+
+    def _as_mounted(self, trajectory: Trajectory) -> Trajectory:
+        T_wc = self.context.camera.as_mounted(trajectory.T_wc)
+        return replace(trajectory, T_wc=T_wc)
 
     def in_map(self) -> NDArray[np.bool_]:
         """Return an ``(N,)`` bool array, True for frames that were tracked in the first sub-map.

@@ -139,7 +139,7 @@ def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
         return Calibration(models[0], source=documents[0].source)
     left, right = found
     P = right.matrix("P", 3, 4)
-    if P[0, 3] == 0 and "P" in left and left.matrix("P", 3, 4)[0, 3] != 0:
+    if not P[:2, 3].any() and "P" in left and left.matrix("P", 3, 4)[:2, 3].any():
         raise InputError(
             f"{_sources(documents)}: the sides seem swapped, because the baseline is in the "
             "projection matrix of the first camera instead of the second; give the left camera "
@@ -415,14 +415,15 @@ def _unrectified(R_left: Array, R_right: Array, P: Array, source: str) -> Array:
 
     Args:
         R_left, R_right: ``(3, 3)`` rotations from each camera into the rectified frame.
-        P: ``(3, 4)`` projection matrix of the rectified right camera.
+        P: ``(3, 4)`` projection matrix of the rectified right camera. The baseline is in its first
+            row, or in its second row if one camera is above the other.
     """
-    if P[0, 0] <= 0 or P[0, 3] == 0:
+    if P[0, 0] <= 0 or P[1, 1] <= 0 or not P[:2, 3].any():
         raise InputError(
             f"{source}: the projection matrix contains no baseline; its fourth number must be the "
             "negative baseline in metres times the focal length."
         )
-    baseline = np.array([-P[0, 3] / P[0, 0], 0.0, 0.0])
+    baseline = np.array([-P[0, 3] / P[0, 0], -P[1, 3] / P[1, 1], 0.0])
     return _rigid(R_left.T @ R_right, R_left.T @ baseline)
 
 

@@ -1,9 +1,10 @@
 """Rectifies images: removes the distortion, and aligns the images of a stereo pair.
 
 The x axis of the rectified pair is the baseline. Its viewing direction is as close as possible to
-the mean viewing direction of the two cameras. The rectified images show the largest rectangle that
-both original images cover. They have no black border, because features on such a border would not
-move with the scene.
+the mean viewing direction of the two cameras. If one camera is above the other, rectification
+therefore turns the images by about 90 degrees (``Camera.quarter_turns``). The rectified images show
+the largest rectangle that both original images cover. They have no black border, because features
+on such a border would not move with the scene.
 
 OpenCV's functions can leave black corners. ``cv2.stereoRectify`` estimates the rectangle from a 9x9
 grid, and ``cv2.fisheye.stereoRectify`` estimates it from four points.
@@ -43,7 +44,8 @@ class Rectification:
         R_left_rectified: ``(3, 3)`` float64. It maps directions from the frame of the rectified
             left camera to the frame of the original left camera.
         left: function that rectifies a left image, ``(H, W)`` uint8 of the calibrated size, by
-            bilinear interpolation. The result has the size of the left camera's images.
+            bilinear interpolation. The result has the size of ``camera``, which is that of the left
+            camera's images, turned if the images are turned.
         right: the same for a right image. If there is no right camera, it returns images unchanged.
         left_depth: function that rectifies a depth image of any type by nearest-neighbour
             interpolation. The result is valid only if rectification does not rotate the camera,
@@ -63,23 +65,24 @@ def rectify(calibration: Calibration) -> Rectification:
     """Compute the rectification of a camera or a stereo pair.
 
     Raises:
-        InputError: the two cameras are not side by side, look in different directions or are
-            swapped, or a distortion cannot be inverted within the image.
+        InputError: one of the two cameras is in front of the other, the cameras look in different
+            directions or are swapped, or a distortion cannot be inverted within the image.
     """
     left, right, source = calibration.left, calibration.right, calibration.source
+    turns = 0
     if right is None or calibration.T_left_right is None:
         cameras, baseline, rectified = [(left, np.eye(3))], 0.0, left.undistorted
     else:
         R_left_right, centre = calibration.T_left_right[:3, :3], calibration.T_left_right[:3, 3]
         baseline = float(np.linalg.norm(centre))
-        R_left_rectified = _between(R_left_right, centre, source)
+        R_left_rectified, turns = _between(R_left_right, centre, source)
         cameras = [(left, R_left_rectified), (right, R_left_right.T @ R_left_rectified)]
         rectified = _is_rectified(left, right, R_left_right, centre)
     if rectified:
         numbers = (left.fx, left.fy), (left.cx, left.cy), baseline, (left.width, left.height)
         camera = replace(_camera(source, *numbers), right_delay=calibration.right_delay)
         return Rectification(camera, np.eye(3), unchanged, unchanged, unchanged, True)
-    camera = _common_view(source, cameras, baseline)
+    camera = _common_view(source, cameras, baseline, turns)
     maps = [_maps(model, R_own_rectified, camera) for model, R_own_rectified in cameras]
     return Rectification(
         replace(camera, right_delay=calibration.right_delay),
@@ -121,8 +124,9 @@ def _is_rectified(
     )
 
 
-def _between(R_left_right: Array, centre: Array, source: str) -> Array:
-    """Compute ``R_left_rectified``, the rotation from the rectified to the original left camera."""
+def _between(R_left_right: Array, centre: Array, source: str) -> tuple[Array, int]:
+    """Compute ``R_left_rectified``, the rotation from the rectified to the original left camera,
+    and the number of quarter turns in it (``Camera.quarter_turns``)."""
     import cv2
 
     turn = cv2.Rodrigues(R_left_right)[0].ravel()
@@ -139,28 +143,34 @@ def _between(R_left_right: Array, centre: Array, source: str) -> Array:
             "a checkerboard has the unit in which the size of the squares was given)."
         )
     x = centre / baseline
-    across = float(half[:, 0] @ x)
-    if across < -np.sqrt(0.5):
+    across, down, ahead = (x @ half).tolist()
+    if abs(ahead) > np.sqrt(0.5) or np.linalg.norm(turn) > np.pi / 2:
+        raise InputError(
+            f"{source}: the cameras are one in front of the other or look in different directions "
+            f"(turned by {np.degrees(np.linalg.norm(turn)):.0f} degrees, the right one at "
+            f"{np.array2string(centre, precision=3, suppress_small=True)} m); check the "
+            "transformation between them."
+        )
+    turns = 0 if abs(across) >= abs(down) else int(np.sign(down))
+    if turns == 0 and across < 0:
         raise InputError(
             f"{source}: the right camera is {baseline:.3f} m to the left of the left one; swap the "
             "cameras, or invert the transformation between them."
         )
-    if across < np.sqrt(0.5) or np.linalg.norm(turn) > np.pi / 2:
-        raise InputError(
-            f"{source}: the cameras are not side by side or look in different directions (turned "
-            f"by {np.degrees(np.linalg.norm(turn)):.0f} degrees, the right one at "
-            f"{np.array2string(centre, precision=3, suppress_small=True)} m); check the "
-            "transformation between them."
-        )
     y = np.cross(half[:, 2], x)
     y /= np.linalg.norm(y)
-    return np.column_stack([x, y, np.cross(x, y)])
+    return np.column_stack([x, y, np.cross(x, y)]), turns
 
 
-def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline: float) -> Camera:
+def _common_view(
+    source: str,
+    cameras: list[tuple[CameraModel, Array]],
+    baseline: float,
+    turns: int,
+) -> Camera:
     """Return the pinhole camera with the widest field of view that all original images cover. It
-    has the image size of the left camera."""
-    bounds = np.array([_inner_rectangle(model, R, source) for model, R in cameras])
+    has the image size of the left camera, after ``turns`` quarter turns."""
+    bounds = np.array([_inner_rectangle(model, R, turns, source) for model, R in cameras])
     (x0, y0), (x1, y1) = bounds[:, 0].max(axis=0), bounds[:, 1].min(axis=0)
     if x0 >= x1 or y0 >= y1:
         raise InputError(
@@ -168,17 +178,20 @@ def _common_view(source: str, cameras: list[tuple[CameraModel, Array]], baseline
             "them."
         )
     width, height = cameras[0][0].width, cameras[0][0].height
+    if turns:
+        width, height = height, width
     focal = max((width - 1) / (x1 - x0), (height - 1) / (y1 - y0))
     cx = (width - 1) / 2 - focal * (x0 + x1) / 2
     cy = (height - 1) / 2 - focal * (y0 + y1) / 2
     focal, cx, cy = float(focal), float(cx), float(cy)
     camera = _camera(source, (focal, focal), (cx, cy), baseline, (width, height))
+    camera = replace(camera, quarter_turns=turns)
     for model, R_own_rectified in cameras:
         _check_view(model, R_own_rectified, camera, source)
     return camera
 
 
-def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) -> Array:
+def _inner_rectangle(model: CameraModel, R_own_rectified: Array, turns: int, source: str) -> Array:
     """Find a rectangle, on the plane z = 1 of the rectified camera, that the image fully covers.
 
     Each side of the rectangle touches one border of the image, at the pixel that is nearest to the
@@ -188,8 +201,9 @@ def _inner_rectangle(model: CameraModel, R_own_rectified: Array, source: str) ->
     Returns:
         ``[[x0, y0], [x1, y1]]``, two opposite corners of the rectangle.
     """
-    found = []
-    for k, border in enumerate(_borders(model.width, model.height)):
+    found, borders = [], _borders(model.width, model.height)
+    for k in range(4):
+        border = borders[(k + turns) % 4]
         rays = unproject(model, border) @ R_own_rectified
         rays = rays[~np.isnan(rays).any(axis=1)]
         if 2 * len(rays) < len(border):

@@ -149,8 +149,8 @@ class Source(_Frames):
         n_expected: number of frames. For a stream, it is approximate. None if it is unknown.
         live: whether frames arrive in real time, as from a camera. Such frames are lost if they are
             not read in time.
-        ground_truth: ``(N, 4, 4)`` float64 ``T_wc``, NaN for frames without a pose. None if there
-            is no ground truth.
+        ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of ``camera``, NaN for frames without a pose.
+            None if there is no ground truth.
         pairing: how many images were paired with a second image by time, and how many images were
             left out. For a stream, only the images that have been read so far are counted. None if
             images are not paired by time.

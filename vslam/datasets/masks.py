@@ -75,7 +75,10 @@ def _masks_in(source: Source, folder: Path) -> Callable[[str | None, int], ReadM
 
 
 def _read(source: Source, path: Path) -> Image:
-    mask, width, height = read_grey(path), source.camera.width, source.camera.height
+    mask, camera = read_grey(path), source.camera
+    width, height = camera.width, camera.height
+    if camera.quarter_turns:  # the original images are not turned yet
+        width, height = height, width
     if mask.shape != (height, width):
         size = size_text(mask.shape)
         why = f"has {size} pixels but the images have {width}x{height}; give the mask this size."

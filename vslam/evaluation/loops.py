@@ -102,7 +102,8 @@ def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
         return None
     if not np.isin(outcome.trajectory.timestamps, truth.timestamps).all():
         return None
-    T_wc, times = truth.T_wc, truth.timestamps
+    # The poses of loops are relative to the images, which may have been turned.
+    T_wc, times = truth.T_wc @ outcome.sequence.camera.T_mounted_camera, truth.timestamps
     done = int(np.searchsorted(times, outcome.trajectory.timestamps[-1], side="right"))
     loops = outcome.loops
     if outcome.alignment == "sim3":

@@ -60,7 +60,8 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
     if table is None or not map_.n_keyframes:
         raise InputError("the run has no map.")
     growth = map_.keyframes.unit_scale[table.reference] / table.unit_scale
-    T_c_reference = table.T_c_reference.copy()
+    # The frames of the table are those of the camera as mounted, as in the trajectory.
+    T_c_reference = stored.camera.T_mounted_camera @ table.T_c_reference
     T_c_reference[:, :3, 3] *= growth[:, None]
     table = table._replace(T_c_reference=T_c_reference)
     graph = essential_graph(map_, stored.loops, config, driven=True)

@@ -132,8 +132,10 @@ def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
 
 
 def ground_truth_of(source: Source) -> Trajectory | None:
-    """Return the poses of all frames with ground truth. None if the source has no ground truth."""
+    """Return the true poses of the camera as mounted for all frames with ground truth. None if the
+    source has no ground truth."""
     if source.ground_truth is None:
         return None
     known = np.flatnonzero(np.isfinite(source.ground_truth).all((1, 2)))
-    return Trajectory(source.timestamps, source.ground_truth).select(known)
+    T_wc = source.camera.as_mounted(source.ground_truth)
+    return Trajectory(source.timestamps, T_wc).select(known)

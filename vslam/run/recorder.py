@@ -345,6 +345,7 @@ class RerunRecorder(Recorder):
         self._n_pictures = 0  # number of pictures recorded so far
         self._hide_rejected_at: int | None = None  # index of a frame
         self._ground_truth: Trajectory | None = None  # None after it was recorded
+        self._T_mounted_camera = np.eye(4)
         try:
             # Otherwise, the time of logging would be the viewer's default timeline.
             self._recording.set_log_time_enabled(False)
@@ -381,7 +382,7 @@ class RerunRecorder(Recorder):
         for name, color in self._points.items():
             log(f"points/{name}", rr.SeriesLines(colors=[color], names=[name]))
         log("world/trajectory", rr.LineStrips3D.from_fields(colors=[_BLUE], radii=[-1.0]))
-        self._ground_truth = ground_truth
+        self._ground_truth, self._T_mounted_camera = ground_truth, camera.T_mounted_camera
 
     @_guarded
     def frame(self, result: TrackResult) -> None:
@@ -527,7 +528,8 @@ class RerunRecorder(Recorder):
         if not self._frames:
             return
         results, self._frames = self._frames, []
-        T_wc = np.array([result.T_wc for result in results])
+        # The images that are shown below the camera may be turned.
+        T_wc = np.array([result.T_wc for result in results]) @ self._T_mounted_camera
         poses = rr.Transform3D.columns(translation=T_wc[:, :3, 3], mat3x3=T_wc[:, :3, :3])
         self._recording.send_columns("world/camera", _times(results), poses)
         extracted = [result for result in results if result.n_features]

@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.camera import Camera
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.synthetic.store import calibration_text
@@ -211,10 +212,10 @@ def _outcome(
     if not (out / "trajectory.txt").is_file():
         raise InputError(f"{settings.detector}: wrote no trajectory.txt into {{out}}.")
     times = np.asarray(sequence.timestamps, np.float64)
-    final = read_poses(out / "trajectory.txt", times, kept)
+    final = _as_mounted(read_poses(out / "trajectory.txt", times, kept), sequence.camera)
     causal = final
     if (out / "causal.txt").is_file():
-        causal = read_poses(out / "causal.txt", times, kept)
+        causal = _as_mounted(read_poses(out / "causal.txt", times, kept), sequence.camera)
     lost = ~final.known
     if (out / "states.txt").is_file():
         states = (out / "states.txt").read_text().split()
@@ -295,6 +296,11 @@ def read_poses(path: Path, times: NDArray[np.float64], kept: NDArray[np.int64]) 
     if known.any():
         T_wc = _last_known(Poses(T_wc, known))
     return Poses(T_wc, known)
+
+
+def _as_mounted(poses: Poses, camera: Camera) -> Poses:
+    """Convert the poses of a system that was given turned images (``Camera.quarter_turns``)."""
+    return Poses(camera.as_mounted(poses.T_wc), poses.known)
 
 
 def _last_known(poses: Poses) -> NDArray[np.float64]:

@@ -20,6 +20,7 @@ from vslam.datasets.association import Pairing
 from vslam.datasets.euroc import open_euroc
 from vslam.datasets.frames import stored_frames
 from vslam.datasets.kitti import open_kitti
+from vslam.datasets.times import Timing, in_order
 from vslam.datasets.tum import open_tum
 from vslam.doctor.checks import check_depth, check_times
 from vslam.doctor.examine import examine
@@ -43,6 +44,7 @@ class Seen:
     dataset: str = "drawn"
     name: str = "corridor"
     pairing: Pairing | None = None
+    timing: Timing | None = None
 
     def __len__(self):
         return len(self.left)
@@ -305,8 +307,8 @@ def test_one_camera_alone(clean):
     alone = replace(clean, second=[None] * len(clean))
     found = {f.check for f in examine(alone, FEW).findings}
     assert found == {
-        "images", "calibration", "features", "sharpness", "order of times", "gaps", "jitter",
-        "scale",
+        "images", "calibration", "features", "sharpness", "order of times", "frame rate", "gaps",
+        "jitter", "scale",
     }  # fmt: skip
 
 
@@ -323,6 +325,37 @@ def test_one_frame_missing_in_a_short_clip_is_no_fault(n, missing, verdict):
 
 def test_few_frames_have_no_rhythm():
     assert [f.verdict for f in check_times(np.array([0.0, 1.0]))] == ["unknown"]
+
+
+@pytest.mark.parametrize(
+    ("times", "verdict", "measured"),
+    [
+        (0.1 * np.arange(9), "good", "10.0 Hz"),
+        (3.0 * np.arange(9), "good", "0.33 Hz"),
+        (104_499.0 * np.arange(9), "fault", "one frame every 1.04e+05 s"),
+        (1e-5 * np.arange(9), "fault", "100000.0 Hz"),
+    ],
+)
+def test_a_rate_that_no_camera_has_is_a_fault(times, verdict, measured):
+    (rate,) = (f for f in check_times(times) if f.check == "frame rate")
+    assert (rate.verdict, rate.measured) == (verdict, measured)
+
+
+def test_the_order_of_times_is_that_of_the_recording():
+    """The reader has left out frames, so that the times of the others increase."""
+    timing = Timing("x", ["x: the names are read as nanoseconds: 10.0 Hz."])
+    recorded = np.r_[0.1 * np.arange(20), 0.1 * np.arange(20) - 30.0]
+    kept = [t for t, _ in in_order(((t, None) for t in recorded.tolist()), timing)]
+    for found in (check_times(np.array(kept), timing), check_times(recorded)):
+        order, rate = found[:2]
+        assert order.verdict == "fault"
+        assert order.measured.startswith("the clock was set back by 32 s after 1.900 s")
+        assert "clock" in order.fix
+        assert "sort" not in order.fix
+        assert rate.verdict == "good"
+    assert check_times(np.array(kept), timing)[1].measured == (
+        "10.0 Hz; x: the names are read as nanoseconds: 10.0 Hz"
+    )
 
 
 @pytest.mark.slow
@@ -364,7 +397,8 @@ def test_the_command_looks_at_the_beginning_of_a_video(corridor, tmp_path, monke
     page = ["--out", str(tmp_path / "page.html")]
     done = CliRunner().invoke(app, ["doctor", str(video), *options, *page])
     assert done.exit_code == 0, done.output
-    assert "0 of 8 intervals are not positive, 10.0 Hz" in done.output
+    assert "the times of 9 frames increase" in done.output
+    assert "10.0 Hz" in done.output
     assert "median vertical error" in done.output
 
 

@@ -13,6 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, Image, calibration_doubts, field_of_view
+from vslam.datasets.times import (
+    GAP,
+    JITTER,
+    Timing,
+    in_order,
+    is_frame_rate,
+    jitter,
+    rate_text,
+)
 from vslam.doctor.findings import Finding, judge
 from vslam.doctor.focal_length import FocalFit
 from vslam.doctor.matching import Matches, count_views
@@ -34,8 +43,6 @@ FEATURES = 0.5  # least share of the requested number of features
 # is 0.43 for KITTI, 0.25 for TUM and 0.27 for EuRoC. After a Gaussian blur of 1.5 px, it is at most
 # 0.17.
 SHARP = 0.18
-JITTER = 0.2  # largest standard deviation of the steps, relative to the interval
-GAP = 1.75  # a longer step, in intervals, means that a frame is missing
 # Largest share of steps with a gap. Two standard deviations are added, because the share is
 # uncertain if there are few steps.
 GAPS = 0.05
@@ -246,26 +253,35 @@ def sharpness(image: Image) -> float:
     return float(np.std(fine) / max(float(np.std(wide)), 1e-6))
 
 
-def check_times(timestamps: Times) -> list[Finding]:
-    """Check timestamps, in seconds, for wrong order, gaps and jitter."""
-    steps = np.diff(timestamps)
-    if len(steps) < 3:
-        return [Finding("times", "unknown", f"{len(timestamps)} frames are too few")]
-    backwards = np.flatnonzero(steps <= 0)
-    interval = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+def check_times(timestamps: Times, timing: Timing | None = None) -> list[Finding]:
+    """Check timestamps, in seconds, for wrong order, an impossible rate, gaps and jitter.
+
+    Args:
+        timing: how the reader put the times in order. None if the times are as they were recorded.
+    """
+    if timing is None:
+        timing = Timing("")
+        found = in_order(((time, None) for time in timestamps.tolist()), timing)
+        timestamps = np.array([time for time, _ in found])
     order = judge(
         "order of times",
-        len(backwards) > 0,
-        f"{len(backwards)} of {len(steps)} intervals are not positive"
-        + (
-            f", the first after frame {backwards[0]}"
-            if len(backwards)
-            else f", {1 / interval:.1f} Hz"
-        ),
-        "sort the frames by time and drop repeated frames",
+        bool(timing.measured),
+        timing.measured or f"the times of {counted(len(timestamps), 'frame')} increase",
+        "do not set the camera's clock during a recording"
+        if timing.set_back
+        else "record each frame once, with the time at which it was taken",
     )
-    if len(backwards):
-        return [order]
+    steps = np.diff(timestamps)
+    if len(steps) < 3:
+        few = Finding("times", "unknown", f"{len(timestamps)} frames are too few")
+        return [order, few] if timing.measured else [few]
+    interval = float(np.median(steps))
+    rate = judge(
+        "frame rate",
+        not is_frame_rate(interval),
+        "; ".join([rate_text(interval), *(remark.rstrip(".") for remark in timing.remarks)]),
+        "correct the unit of the times; if it is right, record more frames",
+    )
     gaps = steps > GAP * interval
     longest = int(np.argmax(steps))
     n = len(steps)
@@ -278,14 +294,14 @@ def check_times(timestamps: Times) -> list[Finding]:
         "frames were lost during recording, or have no partner of the same time: use a faster "
         "disk, a lower rate, or synchronised cameras",
     )
-    jitter = float(np.std(steps[~gaps])) / interval
+    spread = jitter(timestamps)
     steady = judge(
         "jitter",
-        jitter > JITTER,
-        f"standard deviation {100 * jitter:.1f} % of the interval of {1e3 * interval:.1f} ms",
+        spread > JITTER,
+        f"standard deviation {100 * spread:.1f} % of the interval of {1e3 * interval:.1f} ms",
         "stamp frames when they are exposed, not when they arrive",
     )
-    return [order, gap, steady]
+    return [order, rate, gap, steady]
 
 
 def check_depth(images: Sequence[Image], depths: Sequence[Depth]) -> list[Finding]:

@@ -90,7 +90,7 @@ def examine(sequence: Source, config: Config) -> Diagnosis:
         counts = _count_features(sequence, lefts, config)
         findings.append(checks.check_features(counts, config.orb.n_features))
         findings.append(checks.check_sharpness(images))
-    findings += checks.check_times(sequence.timestamps)
+    findings += checks.check_times(sequence.timestamps, sequence.timing)
     if (pairing := sequence.pairing) is not None:
         findings.append(judge("partners", pairing.is_poor, pairing.measured, pairing.fix))
     masked, hidden = _examine_mask(sequence, lefts)

@@ -71,7 +71,7 @@ def headlines(report: ReportJson) -> list[Tile]:
             "Lost frames",
             str(lost),
             f"{share} {report.frames}{_before_map(report)}; {report.weak_frames} weak, "
-            f"{report.skipped_frames} skipped",
+            f"{report.skipped_frames} skipped, {report.left_out_frames} left out",
             "bad" if lost else "good",
         ),
         *_in_map(report),

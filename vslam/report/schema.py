@@ -211,6 +211,8 @@ class ReportJson(Measures, Document):
 
     - ``frames``: number of processed frames.
     - ``skipped_frames``: number of frames with an image that could not be read.
+    - ``left_out_frames``: number of images that the reader left out, because they have no partner
+      or because their times are repeated or out of order. They are no frames of the run.
     - ``dropped_frames``: number of frames that were replaced by a newer frame in a real-time run.
     - ``lost_before_map``: number of lost frames before the first tracked frame. Only a run that
       begins a new map counts these frames.
@@ -237,6 +239,7 @@ class ReportJson(Measures, Document):
     weak_frames: int
     skipped_frames: int
     skipped_messages: list[str]
+    left_out_frames: int = 0
     dropped_frames: int = 0
     frames: int
     warnings: tuple[str, ...] = ()

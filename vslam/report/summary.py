@@ -72,6 +72,7 @@ def summarize(
         weak_frames=states[TrackingState.WEAK],
         skipped_frames=len(outcome.skipped),
         skipped_messages=outcome.skipped,
+        left_out_frames=outcome.n_left_out,
         dropped_frames=states[TrackingState.DROPPED],
         frames=frames,
         warnings=(*outcome.warnings, *_scale_warnings(outcome, evaluation)),

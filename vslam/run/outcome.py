@@ -38,6 +38,8 @@ class RunOutcome:
         tracks: result of tracking each processed frame.
         warnings: problems of the images and of the stereo rig that the run detected, as sentences.
         skipped: a message for each frame whose images could not be read.
+        n_left_out: number of images that the reader left out, because they have no partner or
+            because of their times. For a stream, only the images that were read are counted.
         latency_ms: milliseconds from the arrival of each tracked frame until its pose is known, in
             a real-time run.
         wall_s, cpu_s: wall and CPU seconds from reading the first frame until the last frame is
@@ -77,6 +79,7 @@ class RunOutcome:
     peak_memory_mb: float
     n_keyframes: int
     n_landmarks: int
+    n_left_out: int = 0
     warnings: list[str] = field(default_factory=list)
     latency_ms: list[float] = field(default_factory=list)
     map: Map | None = None

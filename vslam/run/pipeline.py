@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from vslam.camera import Camera, same_camera
 from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import Perturbation, perturbed
+from vslam.datasets.times import jitter_warnings
 from vslam.errors import BrokenSourceError, InputError
 from vslam.features import TrackingState, TrackResult
 from vslam.loopclosure.registry import detector_with_images, problem_of
@@ -314,8 +315,9 @@ def _outcome(
         keyframes=causal_trajectory(keyframes),
         tracks=run.tracks,
         skipped=run.skipped,
+        n_left_out=_count_left_out(sequence),
         warnings=[
-            *_source_warnings(sequence, run.settings),
+            *_source_warnings(sequence, run),
             "the run has no complete map; its poses are those of tracking",
         ],
         wall_s=seconds[0],
@@ -343,7 +345,7 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
         trajectory=run.trajectory(),
         keyframes=slam.keyframe_trajectory(),
         warnings=[
-            *_source_warnings(source, settings),
+            *_source_warnings(source, run),
             *slam.problems,
             *rig_warnings(slam.rig.sides),
             *_map_warnings(slam, source.camera),
@@ -360,9 +362,18 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
     )
 
 
-def _source_warnings(source: Source, settings: RunOptions) -> list[str]:
-    left_out = source.pairing.warnings() if source.pairing is not None else []
-    return [*left_out, *calibration_warnings(source.camera, settings.calib, source.name)]
+def _source_warnings(source: Source, run: _Run) -> list[str]:
+    times = np.array([track.timestamp for track in run.tracks])
+    return [
+        *(source.pairing.warnings() if source.pairing is not None else []),
+        *(source.timing.warnings() if source.timing is not None else []),
+        *jitter_warnings(times, source.name),
+        *calibration_warnings(source.camera, run.settings.calib, source.name),
+    ]
+
+
+def _count_left_out(source: Source) -> int:
+    return sum(len(part.left_out) for part in (source.pairing, source.timing) if part is not None)
 
 
 def _map_warnings(slam: Slam, camera: Camera) -> list[str]:

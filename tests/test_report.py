@@ -719,6 +719,7 @@ def test_interrupted_with_skipped_frames_and_no_keyframe(tmp_path: Path) -> None
         keyframes=outcome.keyframes.select(np.arange(0)),
         tracks=[outcome.tracks[i] for i in done],
         skipped=["7.png: damaged", "8.png: damaged"],
+        n_left_out=3,
         n_keyframes=0,
         interrupted="Ctrl-C",
     )
@@ -727,6 +728,8 @@ def test_interrupted_with_skipped_frames_and_no_keyframe(tmp_path: Path) -> None
     assert (tmp_path / "keyframes.tum").read_text() == ""
     for name in ("report.md", "report.html"):
         assert "Interrupted: Ctrl-C" in (tmp_path / name).read_text()
+        assert "2 skipped, 3 left out" in (tmp_path / name).read_text()
+    assert report.left_out_frames == 3
     truth = read_trajectory(tmp_path / "ground_truth_kitti.txt")
     assert outcome.sequence.ground_truth is not None
     np.testing.assert_allclose(truth.T_wc, outcome.sequence.ground_truth[done], atol=1e-9)

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import weakref
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -39,7 +40,7 @@ from vslam.cli.main import app
 from vslam.datasets import open_sequence
 from vslam.datasets.bag_messages import grey_of
 from vslam.datasets.detection import detect_dataset
-from vslam.datasets.frames import Source, TimedFrame
+from vslam.datasets.frames import Source, TimedFrame, selected
 from vslam.datasets.image_folders import open_images
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions
@@ -126,6 +127,25 @@ def test_a_video_that_loses_stays_close(corridor, tmp_path):
     for k, frame in enumerate(source.frames()):
         error = np.subtract(frame.read(map)[1], corridor.right[k], dtype=float)
         assert np.abs(error).mean() < 4.0
+
+
+def test_a_run_whose_clock_was_set_back_uses_and_counts_every_frame(folder):
+    files = opened(folder, "images")
+
+    def play():
+        for k, frame in enumerate(files.stored):
+            yield replace(frame, timestamp=frame.timestamp - 30.0 * (k >= 6))
+            if k == 3:
+                yield frame
+
+    source = selected(replace(files, stored=(), play=play, timing=None))
+    outcome = run_source(source)
+    assert [track.state for track in outcome.tracks] == [TrackingState.OK] * FRAMES
+    np.testing.assert_allclose(outcome.trajectory.timestamps, files.timestamps, atol=1e-9)
+    assert outcome.n_left_out == 1
+    (said,) = (warning for warning in outcome.warnings if "images" in warning)
+    assert "1 frame left out (1 with the time of the frame before), the first after 0.300 s" in said
+    assert "the clock was set back by 30 s after 0.500 s" in said
 
 
 @pytest.mark.slow

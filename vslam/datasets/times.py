@@ -7,7 +7,6 @@ camera was set back, the times after that are continued.
 
 from __future__ import annotations
 
-import logging
 import re
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -28,8 +27,6 @@ from vslam.trajectory import read_table
 Number = int | float | Decimal
 Times = NDArray[np.float64]
 _Content = TypeVar("_Content")
-
-_log = logging.getLogger(__name__)
 
 GAP = 1.75
 """A longer step, in intervals, means that a frame is missing."""
@@ -222,7 +219,6 @@ class _Order(Generic[_Content]):
         early, self._early = self._early, []
         by = self._last + self._interval(early) - early[0][0]
         self._timing.set_back.append((self._last / self._per_second, by / self._per_second))
-        _log.warning("%s: %s", self._timing.source, self._timing.measured)
         self._shift += by
         for time, content in early:
             yield self._used(time + by, content)

@@ -78,7 +78,10 @@ def test_bags_without_what_is_needed(folder, corridor, tmp_path):
 
 @pytest.mark.parametrize(
     ("flaw", "part"),
-    [("calibrated", "no calibration, and no camera_info"), ("baseline", "camera_info.*baseline")],
+    [
+        ("calibrated", "no calibration, and the camera matrix in /cam0/camera_info is 0"),
+        ("baseline", "camera_info.*baseline"),
+    ],
 )
 def test_a_useless_camera_info_is_not_read_where_there_is_a_calibration(
     folder, corridor, tmp_path, flaw, part
@@ -115,6 +118,38 @@ def test_bags_cut_off(folder, tmp_path, kind, share):
     cut = tmp_path / source.name
     cut.write_bytes(data[: int(share * len(data))])
     refused("cut off", "bag", cut, SourceOptions(calib=(folder / "stereo.yaml",)))
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("ros1", "its index is incomplete\\); repair it with 'rosbag reindex'"),
+        ("mcap", "it has no footer\\); repair it with 'mcap recover'"),
+    ],
+)
+def test_the_end_that_a_bag_lacks(folder, tmp_path, kind, said):
+    source = source_path(folder, kind)
+    cut = tmp_path / source.name
+    cut.write_bytes(source.read_bytes()[:-1])
+    refused(rf"{cut}: the recording was cut off \({said}", "bag", cut, SourceOptions())
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.bag", b"<html>not found</html>", "not a bag, because it does not begin like"),
+        ("a.mcap", b"#ROSBAG V2.0\n" + b"a" * 99, "not a bag, because it does not begin like"),
+        ("a.db3", b"a" * 99, "not a bag, because it does not begin like"),
+        ("a.bag", b"#ROSBAG V1.2\n" + b"a" * 99, "Bag version 102 is not supported.*convert it"),
+        ("a.mcap", b"\x89MCAP0\r\n" * 9, "cannot be read as a bag .*copy it again if it was"),
+    ],
+)
+def test_a_file_that_is_whole_is_not_said_to_be_cut_off(tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    refused(said, "bag", tmp_path / name, SourceOptions())
+    with pytest.raises(InputError) as caught:
+        open_from("bag", tmp_path / name)
+    assert "cut off" not in str(caught.value)
 
 
 def test_a_bag_damaged_in_the_middle_keeps_the_frames_before(folder, tmp_path):

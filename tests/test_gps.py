@@ -170,8 +170,8 @@ BAD = {
     ),
     "no fix": (lambda folder: bag_of(folder / "a.bag", [(1, -1, 48.0, 0)]), "/gps/fix is a fix"),
     "no stamp": (lambda folder: bag_of(folder / "a.bag", [(0, 0, 48.0, 0)]), "no time stamps"),
-    "no bag": (refused("no", "a.bag"), "cannot be read as a bag"),
-    "no bag in capitals": (refused("no", "a.BAG"), "cannot be read as a bag"),
+    "no bag": (refused("no", "a.bag"), "not a bag, because it does not begin like"),
+    "no bag in capitals": (refused("no", "a.BAG"), "not a bag, because it does not begin like"),
 }  # fmt: skip
 
 

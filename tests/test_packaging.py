@@ -151,7 +151,7 @@ def test_a_plain_installation_stays_lean():
     } - {"vslam"}
     assert not [name for name in extras if re.search(rf"\b{name}\b", plain)]
     for library, extra, where in (
-        ("rosbags", "bag", "vslam/datasets/bag.py"),
+        ("rosbags", "bag", "vslam/datasets/bag_files.py"),
         ("pymap3d", "gps", "vslam/datasets/fixes.py"),
         ("distributed", "cluster", "vslam/lab/bench/cluster.py"),
         ("torch", "train", "vslam/cli/train.py"),

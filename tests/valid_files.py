@@ -163,6 +163,21 @@ def bag(kind: str, encoding: str, folder: Path, compression: str = "") -> None:
               camera=_camera(), compression=compression)  # fmt: skip
 
 
+def foxglove(encoding: str, folder: Path) -> None:
+    from foxglove_files import Recorder, calibration, compressed, raw
+    from mcap.writer import CompressionType
+
+    # Otherwise, a checksum would reject every change.
+    plain = {"compression": CompressionType.NONE, "enable_crcs": False}
+    with Recorder(folder / "a.mcap", encoding, **plain) as recorder:
+        for k, pixels in enumerate(noise()[:3]):
+            for side, (kind, packed) in enumerate({"Raw": raw, "Compressed": compressed}.items()):
+                info = calibration(_camera(), side)
+                stamp = 10**8 * (k + 1)
+                recorder.send(f"/{side}/info", "CameraCalibration", stamp, frame_id="", **info)
+                recorder.send(f"/{side}/a", f"{kind}Image", stamp, frame_id="", **packed(pixels))
+
+
 def video(folder: Path) -> None:
     from source_files import write_calibration, write_video
 

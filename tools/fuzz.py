@@ -231,6 +231,11 @@ def _read_weights(folder: Path) -> None:
     load_network(folder / "net.safetensors")
 
 
+def _foxglove(encoding: str) -> Reader:
+    write = partial(valid_files.foxglove, encoding)
+    return Reader(write, partial(_read_source, "bag", "a.mcap"), "a.mcap")
+
+
 def _bag(kind: str, encoding: str, data: str, changed: str, compression: str = "") -> Reader:
     write = partial(valid_files.bag, kind, encoding, compression=compression)
     return Reader(write, partial(_read_source, "bag", data), changed)
@@ -314,6 +319,8 @@ READERS: dict[str, Reader] = {
     "bag-ros1": _bag("ros1", "mono8", "a.bag", "a.bag"),
     "bag-ros2": _bag("ros2", "png", "a", "a/*"),
     "bag-mcap": _bag("folder", "mono16", "a", "a/*"),
+    "foxglove-json": _foxglove("json"),
+    "foxglove-protobuf": _foxglove("protobuf"),
     "bag-lz4": _bag("ros1", "mono8", "a.bag", "a.bag", "lz4"),
     "bag-zstd": _bag("folder", "mono8", "a", "a/*", "storage"),
     "video": Reader(valid_files.video, _read_video, "*.*"),

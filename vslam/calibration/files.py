@@ -21,6 +21,12 @@ from vslam.calibration.formats import (
 from vslam.calibration.models import Calibration, CameraModel
 from vslam.errors import InputError, write_file
 
+NEEDED_CALIBRATION = (
+    "give a file with the cameras' focal lengths, centres, distortion and, for two cameras, "
+    "baseline (docs/howto/cameras.md)"
+)
+"""What to do if there is no calibration, for error messages."""
+
 _Reader = Callable[[Sequence[Document], Size | None], Calibration]
 # For each format: the keys by which it is recognised, its reader, and the largest number of files.
 # The first format whose keys are all in one file is used.

@@ -139,7 +139,13 @@ def read_ros(documents: Sequence[Document], size: Size | None) -> Calibration:
         return Calibration(models[0], source=documents[0].source)
     left, right = found
     P = right.matrix("P", 3, 4)
-    if not P[:2, 3].any() and "P" in left and left.matrix("P", 3, 4)[:2, 3].any():
+    if not P[:2, 3].any():
+        if "P" not in left or not left.matrix("P", 3, 4)[:2, 3].any():
+            raise InputError(
+                f"{_sources(documents)}: the projection matrices contain no baseline, which is the "
+                "negative fourth number of P divided by its first; give a calibration that "
+                "contains the baseline with --calib."
+            )
         raise InputError(
             f"{_sources(documents)}: the sides seem swapped, because the baseline is in the "
             "projection matrix of the first camera instead of the second; give the left camera "

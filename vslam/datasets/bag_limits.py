@@ -1,8 +1,8 @@
-"""Limits the decompressed size of bags, because rosbags itself sets no limit.
+"""Limits the decompressed size of bags, because rosbags and mcap set no limit.
 
 Without a limit, a bag of a few kilobytes could decompress to gigabytes. rosbags looks up its
-decompression functions in tables. This module replaces the functions in these tables with
-functions that stop at a limit.
+decompression functions in tables, and mcap in two modules. This module replaces these functions
+with functions that stop at a limit.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ class _Decompressor(Protocol):
 
 
 def limit_bags() -> None:
-    """Make rosbags reject chunks, messages and files that are too large to decompress."""
+    """Make rosbags and mcap reject chunks, messages and files that are too large to decompress."""
     import lz4.frame
+    from mcap import stream_reader
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import reader, storage_mcap
 
@@ -53,6 +54,10 @@ def limit_bags() -> None:
         storage_mcap.DECOMPRESSORS.update(
             {name: _limited_by_size(kinds[name]) for name in ("lz4", "zstd")}
         )
+
+        mcap: Any = stream_reader
+        mcap.lz4 = SimpleNamespace(decompress=_limited(kinds["lz4"]))
+        mcap.zstandard = SimpleNamespace(decompress=_limited_by_size(kinds["zstd"]))
 
         def opened(file: Any, mode: str) -> _LimitedFile:
             return _LimitedFile(zstd.open(file, mode))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from vslam.calibration.files import read_calibration
+from vslam.calibration.files import NEEDED_CALIBRATION, read_calibration
 from vslam.calibration.models import Calibration
 from vslam.datasets import open_sequence
 from vslam.datasets.detection import detect_dataset
@@ -173,11 +174,12 @@ def open_raw(options: SourceOptions) -> RawSource:
 
 def _open_stream(
     dataset: str, options: SourceOptions, monocular: bool
-) -> tuple[RawSource, Calibration | None]:
-    """Return the source, and the calibration that a bag or depth camera stores."""
+) -> tuple[RawSource, Callable[[], Calibration] | None]:
+    """Return the source, and a function that reads the calibration that a bag or depth camera
+    stores."""
     o = options
     raw: RawSource
-    own: Calibration | None = None
+    own: Callable[[], Calibration] | None = None
     if dataset == "video":
         from vslam.datasets.video import open_video
 
@@ -189,7 +191,7 @@ def _open_stream(
         raw = bag = open_bag(
             Path(o.data), topics=topics, sensor=o.sensor, depth_scale=o.depth_scale
         )
-        own = None if o.calib else find_calibration(bag)
+        own = partial(find_calibration, bag)
     elif dataset in DEPTH_CAMERAS:
         from vslam.datasets.depth_cameras import frames_of
         from vslam.datasets.oakd import open_oakd
@@ -197,7 +199,7 @@ def _open_stream(
 
         opened = open_oakd if dataset == "oakd" else open_realsense
         device = opened(o.data, "mono" if monocular else o.sensor)
-        raw, own = frames_of(device), device.calibration
+        raw, own = frames_of(device), partial(getattr, device, "calibration")
     else:
         from vslam.datasets.video import open_camera
 
@@ -227,7 +229,7 @@ def _calibration(
     dataset: str,
     options: SourceOptions,
     size: tuple[int, int],
-    own: Calibration | None = None,
+    own: Callable[[], Calibration] | None = None,
 ) -> Calibration:
     if options.calib:
         return read_calibration(options.calib, size)
@@ -243,9 +245,5 @@ def _calibration(
                 f"{options.data}: images of a drive of KITTI raw; open the drive with --data "
                 f"{folder.parent.parent}, or give a calibration with --calib."
             )
-        where = ", and no camera_info in the bag" if dataset == "bag" else ""
-        raise InputError(
-            f"--calib: no calibration{where}; give a file with the cameras' focal lengths, "
-            "centres, distortion and, for two cameras, baseline (docs/howto/cameras.md)."
-        )
-    return own
+        raise InputError(f"--calib: no calibration; {NEEDED_CALIBRATION}.")
+    return own()

@@ -44,6 +44,7 @@ from vslam.trajectory import (
     Trajectory,
     read_kitti_poses,
     read_trajectory,
+    write_euroc,
     write_kitti,
     write_tum,
 )
@@ -675,6 +676,29 @@ def test_eval(call, tmp_path):
     assert "evo_ape kitti gt.txt estimate.txt --align\n" in out
     code, out, _ = call("eval", "estimate.txt", "--gt", "gt.txt", "--json")
     assert json.loads(out)["ate_rmse_m"] == pytest.approx(0.1, rel=1e-3)
+
+
+def test_eval_warns_of_a_ground_truth_that_cannot_be_right(call, tmp_path):
+    t = 0.1 * np.arange(50)
+    T_wc = circle(50)
+    T_wc[:, 1, 3] = np.sin(t)
+    write_euroc(tmp_path / "estimate.csv", Trajectory(t, T_wc))
+    for factors, says in (
+        ([1.0, -1.0, 1.0], "Warning: the ground truth is a mirror image of the trajectory"),
+        ([2.0, 2.0, 2.0], "Warning: the trajectory is 0.5 times as large as the ground truth"),
+        ([1.0, 1.0, 1.0], ""),
+    ):
+        truth = T_wc.copy()
+        truth[:, :3, 3] *= factors
+        write_euroc(tmp_path / "gt.csv", Trajectory(t, truth))
+        code, out, err = call("eval", "estimate.csv", "--gt", "gt.csv")
+        assert code == 0, err
+        assert says in out
+        assert ("Warning" in out) == bool(says)
+        warnings = json.loads(call("eval", "estimate.csv", "--gt", "gt.csv", "--json")[1])[
+            "warnings"
+        ]
+        assert len(warnings) == bool(says)
 
 
 def test_eval_of_two_formats_names_no_evo_command(call, tmp_path):

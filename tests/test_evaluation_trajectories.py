@@ -16,13 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from vslam.errors import InputError
 from vslam.evaluation.trajectories import (
+    command_of_evo,
     evaluate_trajectory,
     evo_command,
     kitti_drift,
     path_length,
     read_pair,
 )
-from vslam.trajectory import Trajectory, trajectory_format, write_kitti, write_tum
+from vslam.trajectory import Trajectory, trajectory_format, write_euroc, write_kitti, write_tum
 
 
 def drive(n: int = 2001, step: float = 0.5, turn: float = 0.004) -> Trajectory:
@@ -169,10 +170,11 @@ def test_path_length():
 def test_different_lengths_are_matched_by_time():
     truth = drive(500)
     estimate = moved(truth.select(np.arange(100, 400, 3)), RIGID)
-    estimate = Trajectory(estimate.timestamps + 0.004, estimate.T_wc)
     result = evaluate_trajectory(estimate, truth)
-    assert result.frames == 100
+    assert (result.frames, result.interpolated) == (100, 0)
     assert result.ate_rmse_m < 1e-9
+    late = Trajectory(estimate.timestamps + 0.004, estimate.T_wc)
+    assert evaluate_trajectory(late, truth).interpolated == 100
     # Now the longer trajectory is the estimate.
     assert evaluate_trajectory(truth, estimate).frames == 100
 
@@ -264,3 +266,122 @@ def test_summary_has_the_numbers_only():
     assert "errors_m" not in summary
     assert summary["frames"] == 50
     assert isinstance(summary["ate_rmse_m"], float)
+
+
+def winding(n: int = 300) -> Trajectory:
+    """Return the poses of a camera that moves and turns in three dimensions at 10 Hz."""
+    t = 0.1 * np.arange(n)
+    T_wc = np.tile(np.eye(4), (n, 1, 1))
+    T_wc[:, :3, 3] = np.column_stack([np.sin(t), np.cos(0.7 * t), 0.5 * np.sin(0.4 * t)])
+    turns = np.column_stack([0.3 * np.sin(t), 0.4 * t, 0.2 * np.cos(0.5 * t)])
+    T_wc[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+    return Trajectory(t, T_wc)
+
+
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize("alignment", ["se3", "sim3", "none"])
+@pytest.mark.parametrize("of_rotations", [np.eye(4), MIRROR])
+def test_a_mirrored_ground_truth_is_named(alignment, of_rotations):
+    truth = winding()
+    mirrored = truth.T_wc.copy()
+    mirrored[:, :3, :3] = of_rotations[:3, :3] @ truth.T_wc[:, :3, :3] @ of_rotations[:3, :3]
+    mirrored[:, :3, 3] = truth.T_wc[:, :3, 3] @ MIRROR[:3, :3]
+    estimate = moved(noisy(truth, 0.01), RIGID)
+    found = evaluate_trajectory(estimate, Trajectory(truth.timestamps, mirrored), alignment)
+    assert "mirror image of the trajectory" in found.warnings[0]
+    assert not evaluate_trajectory(estimate, truth, alignment).warnings
+
+
+@pytest.mark.parametrize("alignment", ["se3", "none"])
+def test_turns_tell_that_a_path_in_a_plane_is_mirrored(alignment):
+    truth = drive(1000, turn=0.004)
+    wrong = truth.T_wc.copy()
+    wrong[:, 0, 3] *= -1.0
+    estimate = moved(noisy(truth, 0.1), RIGID)
+    found = evaluate_trajectory(estimate, Trajectory(truth.timestamps, wrong), alignment)
+    assert "turns against the trajectory" in found.warnings[0]
+    # A mirrored world with mirrored cameras is the same plane seen from the other side.
+    same = MIRROR @ truth.T_wc @ MIRROR
+    assert not evaluate_trajectory(estimate, Trajectory(truth.timestamps, same)).warnings
+    # The axes of NED, and another frame of the vehicle
+    ned = np.eye(4)
+    ned[:3, :3] = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
+    assert not evaluate_trajectory(
+        estimate, Trajectory(truth.timestamps, ned @ truth.T_wc @ RIGID)
+    ).warnings
+
+
+def test_a_bad_estimate_is_no_mirror_image():
+    truth = winding()
+    bent = truth.T_wc.copy()
+    bent[:, 2, 3] = 0.0
+    assert not evaluate_trajectory(Trajectory(truth.timestamps, bent), truth).warnings
+    assert not evaluate_trajectory(noisy(straight(200, 0.1), 0.01), straight(200, 0.1)).warnings
+
+
+@pytest.mark.parametrize(
+    ("unit", "name"), [(1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")]
+)
+@pytest.mark.parametrize("start", [0.0, 312.0, 1.7e9])
+def test_times_in_another_unit_are_read_and_named(unit, name, start):
+    truth = winding()
+    seconds = Trajectory(start + truth.timestamps, truth.T_wc)
+    other = Trajectory(seconds.timestamps / unit, truth.T_wc)
+    some = seconds.select(np.arange(30, 290, 2))
+    for estimate, gt, what in ((some, other, "ground truth"), (other, some, "trajectory")):
+        found = evaluate_trajectory(estimate, gt)
+        assert found.ate_rmse_m < 1e-6
+        assert found.warnings == (
+            f"the times of the {what} are read as {name}, because only then do they agree with "
+            f"those of the {'ground truth' if what == 'trajectory' else 'trajectory'}.",
+        )
+    late = Trajectory(some.timestamps / unit + 0.02 / unit, some.T_wc)  # both in this unit
+    found = evaluate_trajectory(late, other)
+    assert (found.frames, len(found.warnings)) == (130, 2)
+    assert name in found.warnings[0]
+
+
+def test_a_constant_offset_between_the_clocks_is_named():
+    truth = winding()
+    later = Trajectory(truth.timestamps + 1.4e9, truth.T_wc)
+    with pytest.raises(InputError, match=r"add 1400000000\.000 s to those of the ground truth"):
+        evaluate_trajectory(later, truth)
+
+
+def test_sparse_ground_truth_is_used_once():
+    """No frame between poses that are far apart has a ground truth."""
+    estimate = Trajectory(np.arange(1000) / 200.0, winding(1000).T_wc)
+    truth = estimate.select(np.arange(0, 1000, 40))
+    found = evaluate_trajectory(estimate, truth)
+    assert (found.frames, found.interpolated) == (25, 0)
+    assert found.ate_rmse_m < 1e-9
+    shifted = Trajectory(truth.timestamps + 0.003, truth.T_wc)
+    assert evaluate_trajectory(estimate, shifted).frames == 25
+
+
+def test_read_pair_of_euroc_files(tmp_path):
+    truth = winding()
+    write_euroc(tmp_path / "truth.csv", truth)
+    write_euroc(tmp_path / "estimate.csv", truth.select(np.arange(0, 300, 7)))
+    write_tum(tmp_path / "estimate.tum", truth)
+    for name in ("estimate.csv", "estimate.tum"):
+        files = tmp_path / name, tmp_path / "truth.csv"
+        found = evaluate_trajectory(*read_pair(*files))
+        assert found.ate_rmse_m < 1e-9
+        assert command_of_evo(*files, found) is None
+
+
+def test_evo_is_named_only_where_it_compares_the_same_poses(tmp_path):
+    truth = winding()
+    late = Trajectory(truth.timestamps + 0.004, truth.T_wc)
+    for name, one in (("estimate", truth), ("truth", truth), ("late", late)):
+        write_tum(tmp_path / name, one)
+    (tmp_path / "commas").write_text((tmp_path / "estimate").read_text().replace(" ", ","))
+    named = {}
+    for name in ("estimate", "late", "commas"):
+        files = tmp_path / name, tmp_path / "truth"
+        named[name] = command_of_evo(*files, evaluate_trajectory(*read_pair(*files)))
+    assert named["estimate"] is not None
+    assert named["late"] is named["commas"] is None

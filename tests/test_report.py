@@ -27,7 +27,7 @@ from vslam.report.trajectory_figures import loop_closing, top_view
 from vslam.run.loop_pictures import LoopPicture
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
-from vslam.trajectory import Trajectory, read_trajectory
+from vslam.trajectory import Trajectory, read_trajectory, write_tum
 
 FIGURES = {
     "top_view",
@@ -319,6 +319,29 @@ def test_a_trajectory_of_another_scale_is_reported(sensor, scale: float, says: s
     warnings = summarize(outcome, evaluate_run(outcome)[0], None, None).warnings
     assert len(warnings) == (says is not None)
     assert says is None or says in warnings[0]
+
+
+@pytest.mark.parametrize(("step", "covered"), [(0.05, 19), (0.1, 10)])
+def test_frames_between_others_get_a_ground_truth_as_in_eval(tmp_path: Path, step, covered):
+    """A reader of another package may give a pose to every second frame."""
+    outcome = make_outcome(20)
+    times = step * np.arange(20)
+    truth = outcome.sequence.ground_truth.copy()
+    truth[1::2] = np.nan
+    outcome = replace(
+        outcome,
+        sequence=_Sequence(times, truth),
+        trajectory=replace(outcome.trajectory, timestamps=times),
+    )
+    found, remark = evaluate_run(outcome)
+    assert found.frames == len(outcome.ground_truth) == covered
+    assert remark == f"{covered} of 20 frames have a ground truth"
+    estimate, given = tmp_path / "estimate.tum", tmp_path / "truth.tum"
+    write_tum(estimate, outcome.trajectory)
+    write_tum(given, Trajectory(times[::2], truth[::2]))
+    again = evaluate_trajectory(*read_pair(estimate, given))
+    assert again.frames == covered
+    assert again.ate_rmse_m == pytest.approx(found.ate_rmse_m, abs=1e-6)
 
 
 def test_a_camera_that_stands_still_has_no_scale():

@@ -33,7 +33,7 @@ from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
-from vslam.trajectory import Trajectory, write_tum
+from vslam.trajectory import Trajectory, write_kitti, write_tum
 
 REAL = Path(__file__).parents[2] / "shared/data/tum/rgbd_dataset_freiburg1_desk"
 SCALE = 1000.0
@@ -247,10 +247,42 @@ def test_sequences_are_found_by_name(tree):
         open_tum(tree.parent, "desk")
 
 
+def test_sparse_ground_truth_is_used_where_it_has_the_time_of_a_frame(copy, corridor):
+    """There are 0.3 s between the poses, so that none can be interpolated."""
+    known = np.arange(0, FRAMES, 3)
+    times = corridor.timestamps
+    write_tum(copy / "groundtruth.txt", Trajectory(times[known] + 0.004, corridor.T_wc[known]))
+    source = open_tum(copy)
+    truth = source.ground_truth
+    assert np.flatnonzero(np.isfinite(truth).all((1, 2))).tolist() == known.tolist()
+    np.testing.assert_allclose(truth[known], corridor.T_wc[known], atol=1e-8)
+    assert not source.warnings
+
+
+def test_ground_truth_in_another_unit_or_of_another_clock(copy, corridor):
+    truth = np.loadtxt(copy / "groundtruth.txt")
+    expected = open_tum(copy).ground_truth
+    for unit, name in ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds")):
+        np.savetxt(copy / "groundtruth.txt", truth / [unit, *[1.0] * 7], fmt="%.6f")
+        source = open_tum(copy)
+        np.testing.assert_allclose(source.ground_truth, expected, atol=1e-5)
+        assert (
+            f"groundtruth.txt: the times of the ground truth are read as {name}"
+            in (source.warnings[0])
+        )
+    np.savetxt(copy / "groundtruth.txt", truth + np.eye(8)[0] * 1e9, fmt="%.9f")
+    source = open_tum(copy)
+    assert source.ground_truth is None
+    assert "covers none of the frames" in source.warnings[0]
+    assert "add -1000000000.000 s to those of the poses" in source.warnings[0]
+    write_kitti(copy / "groundtruth.txt", corridor.T_wc)
+    refused(copy, "groundtruth.txt: the poses have no times", "remove the file")
+
+
 def test_bad_input_of_tum(copy, tmp_path):
     refused(tmp_path / "nowhere", "no rgb.txt", "download")
     refused(copy, "--start 16", start=FRAMES)
-    (copy / "groundtruth.txt").write_text("100.0 0 0 0 0 0 0 1\n")
+    (copy / "groundtruth.txt").write_text("5000.0 0 0 0 0 0 0 1\n")
     assert open_tum(copy, "").ground_truth is None
     depth = (copy / "depth.txt").read_text().splitlines()
     (copy / "depth.txt").write_text("\n".join(reversed(depth)))

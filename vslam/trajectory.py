@@ -5,13 +5,17 @@ Each line holds one pose:
 - KITTI (Geiger et al., CVPR 2012): the upper 3x4 part of ``T_wc``, row by row, without time.
 - TUM (Sturm et al., IROS 2012): ``t x y z qx qy qz qw``, with t in seconds and the position in
   metres.
-- EuRoC (Burri et al., IJRR 2016): ``t,x,y,z,qw,qx,qy,qz``, with t in nanoseconds. This format is
-  only written, not read.
+- EuRoC (Burri et al., IJRR 2016): ``t,x,y,z,qw,qx,qy,qz``, with t in nanoseconds. Three velocities,
+  or nine velocities and biases, may follow.
+
+The numbers are separated by spaces, tabs, commas or semicolons. The first line may name the
+columns.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +27,27 @@ from numpy.typing import NDArray
 from vslam.errors import InputError
 from vslam.geometry import compose, inverse, orthonormalised, se3_exp, se3_log
 
-_FORMAT_OF_COLUMNS: dict[int, Literal["kitti", "tum"]] = {12: "kitti", 8: "tum"}
+Format = Literal["kitti", "tum", "euroc"]
+
+_POSE_COLUMNS = (12, 8, 11, 17)
+# What a line with this number of numbers probably is, for messages.
+_KINDS = {
+    3: " (a position without time and orientation)",
+    4: " (a time and a position without orientation)",
+    7: " (a pose without time)",
+    8: " (a time, a position and a quaternion, as in TUM's format)",
+    12: " (a 3x4 matrix without time, as in KITTI's format)",
+    16: " (a 4x4 matrix)",
+    17: " (a state of EuRoC)",
+}
+# What a file is whose first line begins like this.
+_NOT_THE_FILE = {"<": "a web page", "version https://git-lfs": "a pointer of Git LFS"}
+_UNITS_S = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0}
+_UNIT_OF_COLUMN = re.compile(r"(?:^|[\[(_ ])(ns|us|ms|s|sec)[\])]?$")
+# Seconds from one pose to the next, and seconds since 1970, that a trajectory can have. A file
+# whose times exceed these limits uses another unit.
+_STEPS_S = (5e-4, 10.0)
+_LATEST_S = 1e10  # the year 2286
 
 # Published poses are rounded to about 7 digits. A matrix with a larger error is not a rotation.
 _ROTATION_TOLERANCE = 1e-3
@@ -70,10 +94,30 @@ def bridge_gaps(trajectory: Trajectory, known: NDArray[np.bool_]) -> Trajectory:
     return Trajectory(times, T_wc)
 
 
+@dataclass(frozen=True)
+class _Table:
+    """The numbers of a text file.
+
+    Attributes:
+        rows: ``(N, C)`` float64, N >= 1, all finite.
+        names: the names of the columns. Empty if no line before the first row names them.
+        commas: whether the first row is separated by commas or semicolons.
+        whole: whether the first number of the first row is written as a whole number.
+    """
+
+    rows: NDArray[np.float64]
+    names: tuple[str, ...]
+    commas: bool
+    whole: bool
+
+
 def read_table(
     path: Path | str, columns: tuple[int, ...], what: str, max_rows: int | None = None
 ) -> NDArray[np.float64]:
-    """Read a text file of numbers. Blank lines and lines that begin with ``#`` are skipped.
+    """Read a text file of numbers, which are separated by spaces, tabs, commas or semicolons.
+
+    Blank lines and lines that begin with ``#`` are skipped, and so is a first line without any
+    number, which names the columns.
 
     Args:
         columns: the allowed numbers of columns. All lines must have the same number of columns.
@@ -83,52 +127,113 @@ def read_table(
         ``(N, C)`` float64 with N >= 1, all finite.
 
     Raises:
-        InputError: the file is missing, empty or malformed, or it holds NaN or infinity.
+        InputError: the file is missing, empty, malformed or of another kind, or it holds NaN or
+            infinity.
     """
+    return _read_table(path, columns, what, max_rows).rows
+
+
+def _read_table(
+    path: Path | str, columns: tuple[int, ...], what: str, max_rows: int | None = None
+) -> _Table:
     try:
-        lines = Path(path).read_text().splitlines()
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     except OSError as error:
         raise InputError(f"{path}: cannot read the file ({error.strerror}).") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file; give one with {what} on each line.") from error
     rows: list[list[float]] = []
+    names: list[str] = []
+    first = ""
+    again = "repair the line or download the file again"
     for number, line in enumerate(lines, start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
+        words = _words(line)
+        if not words:
+            continue
+        if line.lstrip().startswith("#"):
+            names = names if rows else _column_names(line)
+            continue
+        first = first or line.strip()
+        if first == line.strip() and not any(map(_is_number, words)):
+            _refuse_other_content(path, first)
+            names = _column_names(line)
             continue
         where = f"{path}: line {number}"
-        try:
-            row = [float(word) for word in words]
-        except ValueError as error:
+        fix = again if rows else f"give a file with {what} on each line"
+        if not all(map(_is_number, words)):
+            raise InputError(f"{where} is not a row of numbers; {fix}.")
+        row = [float(word) for word in words]
+        if len(row) not in ((len(rows[0]),) if rows else columns):
+            allowed = str(len(rows[0])) if rows else _any_of(columns)
+            kind = _KINDS.get(len(row), "") if "pose" in what and not rows else ""
             raise InputError(
-                f"{where} is not a row of numbers; repair the line or download the file again."
-            ) from error
-        wanted = (len(rows[0]),) if rows else columns
-        if len(row) not in wanted:
-            allowed = " or ".join(map(str, wanted))
-            raise InputError(
-                f"{where} has {len(row)} numbers where {what} takes {allowed}; "
-                "repair the line or download the file again."
+                f"{where} has {len(row)} numbers{kind} where {what} takes {allowed}; {fix}."
             )
         if not np.isfinite(row).all():
-            raise InputError(
-                f"{where} holds NaN or infinity; repair the line or download the file again."
-            )
+            raise InputError(f"{where} holds NaN or infinity; {again}.")
+        if not rows:
+            commas, whole = "," in line or ";" in line, words[0].isdecimal()
         rows.append(row)
         if len(rows) == max_rows:
             break
     if not rows:
-        raise InputError(f"{path}: the file is empty; it must have {what} on each line.")
-    return np.array(rows)
+        held = f'has no numbers (it begins with "{first[:40]}")' if first else "is empty"
+        raise InputError(f"{path}: the file {held}; it must have {what} on each line.")
+    return _Table(np.array(rows), tuple(names), commas, whole)
 
 
-def trajectory_format(path: Path | str) -> Literal["kitti", "tum"]:
-    """Determine the format of a trajectory file from the number of columns of its first pose.
+def _words(line: str) -> list[str]:
+    """Split a line at spaces, commas and semicolons."""
+    return re.sub("[,;]", " ", line).split()
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _any_of(numbers: tuple[int, ...]) -> str:
+    *others, last = map(str, numbers)
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def _column_names(line: str) -> list[str]:
+    """Return the names of the columns in lower case, or an empty list for another comment."""
+    line = line.strip().lstrip("#").lower()
+    names = re.split("[,;]", line) if re.search("[,;]", line) else line.split()
+    return [name.strip() for name in names]
+
+
+def _refuse_other_content(path: Path | str, first: str) -> None:
+    for beginning, content in _NOT_THE_FILE.items():
+        if first.startswith(beginning):
+            raise InputError(f"{path}: holds {content}, not the data; download the file again.")
+
+
+def trajectory_format(path: Path | str) -> Format:
+    """Determine the format of a trajectory file from its first pose and the names of its columns.
 
     Raises:
-        InputError: the file is missing, empty or malformed.
+        InputError: the file is missing, empty, malformed or of another kind.
     """
-    return _FORMAT_OF_COLUMNS[read_table(path, (12, 8), "a pose", max_rows=1).shape[1]]
+    return _format(_read_table(path, _POSE_COLUMNS, "a pose", max_rows=2))
+
+
+def _format(table: _Table) -> Format:
+    n = table.rows.shape[1]
+    if n != 8:
+        return "kitti" if n == 12 else "euroc"
+    if len(table.names) == n:  # the part in brackets is the unit
+        quaternion = [re.sub(r"[\[(].*", "", name).strip() for name in table.names[4:]]
+        if quaternion[0].endswith("w"):
+            return "euroc"
+        if quaternion[3].endswith("w"):
+            return "tum"
+    nanoseconds = table.whole and could_be_seconds(1e-9 * table.rows[:2, 0])
+    return "euroc" if table.commas and nanoseconds else "tum"
 
 
 def read_kitti_poses(path: Path | str) -> NDArray[np.float64]:
@@ -141,18 +246,24 @@ def read_kitti_poses(path: Path | str) -> NDArray[np.float64]:
 
 
 def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = None) -> Trajectory:
-    """Read a KITTI (12 columns) or TUM (8 columns) trajectory.
+    """Read a trajectory in the format of KITTI (12 columns), TUM (8) or EuRoC (8, 11 or 17).
+
+    A file with 8 columns is EuRoC's if the names of its columns say that the quaternion begins with
+    w. If no line names the columns, it is EuRoC's if its columns are separated by commas and its
+    times are whole numbers of nanoseconds. The poses are returned as they are in the file: EuRoC's
+    ground truth contains poses of the body (IMU), not of a camera.
 
     Args:
         timestamps: ``(N,)`` timestamps in seconds of the poses of a KITTI file. None uses the frame
-            numbers. A TUM file contains timestamps, so this argument is ignored.
+            numbers. The other formats contain timestamps, so this argument is ignored.
 
     Raises:
         InputError: the file is malformed, the numbers of poses and timestamps differ, a rotation is
-            invalid, or the timestamps of a TUM file do not increase.
+            invalid, or the timestamps do not increase.
     """
-    rows = read_table(path, (12, 8), "a pose")
-    if _FORMAT_OF_COLUMNS[rows.shape[1]] == "kitti":
+    table = _read_table(path, _POSE_COLUMNS, "a pose")
+    rows, format_ = table.rows, _format(table)
+    if format_ == "kitti":
         if timestamps is None:
             timestamps = np.arange(len(rows), dtype=np.float64)
         elif len(timestamps) != len(rows):
@@ -164,17 +275,41 @@ def read_trajectory(path: Path | str, timestamps: NDArray[np.float64] | None = N
 
     from scipy.spatial.transform import Rotation
 
-    if (bad := np.flatnonzero(np.diff(rows[:, 0]) <= 0)).size:
+    step = np.diff(rows[:, 0])
+    if (bad := np.flatnonzero(step <= 0)).size:
+        fix = "sort the poses by time" if (step < 0).any() else "remove one of them"
         raise InputError(
-            f"{path}: the time of pose {bad[0] + 2} is not later than the one before it; "
-            "sort the poses by time."
+            f"{path}: the time of pose {bad[0] + 2} is not later than the one before it; {fix}."
         )
-    if not np.allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=_ROTATION_TOLERANCE):
-        raise InputError(f"{path}: the length of a quaternion is not 1; normalise qx qy qz qw.")
+    if not np.allclose(np.linalg.norm(rows[:, 4:8], axis=1), 1.0, atol=_ROTATION_TOLERANCE):
+        order = "qx qy qz qw" if format_ == "tum" else "qw qx qy qz"
+        raise InputError(f"{path}: the length of a quaternion is not 1; normalise {order}.")
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_wc[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    T_wc[:, :3, :3] = Rotation.from_quat(rows[:, 4:8], scalar_first=format_ == "euroc").as_matrix()
     T_wc[:, :3, 3] = rows[:, 1:4]
-    return Trajectory(rows[:, 0], T_wc)
+    return Trajectory(rows[:, 0] * _unit_s(table, format_), T_wc)
+
+
+def could_be_seconds(times: NDArray[np.float64]) -> bool:
+    """Return whether ``(N,)`` increasing times can be those of a trajectory in seconds.
+
+    They cannot if they are after the year 2286, or if the median step is below 0.5 ms or above
+    10 s.
+    """
+    if abs(times[-1]) > _LATEST_S:
+        return False
+    return len(times) < 2 or _STEPS_S[0] <= float(np.median(np.diff(times))) <= _STEPS_S[1]
+
+
+def _unit_s(table: _Table, format_: Format) -> float:
+    """Return the unit of the times in seconds: the unit in the name of the first column, or the
+    unit of the format."""
+    if len(table.names) == table.rows.shape[1] and (
+        named := _UNIT_OF_COLUMN.search(table.names[0])
+    ):
+        return _UNITS_S[named[1]]
+    nanoseconds = format_ == "euroc" and could_be_seconds(1e-9 * table.rows[:, 0])
+    return 1e-9 if nanoseconds else 1.0
 
 
 def write_kitti(path: Path | str, T_wc: NDArray[np.float64]) -> None:
@@ -262,7 +397,13 @@ def _poses_of_rows(path: Path | str, rows: NDArray[np.float64]) -> NDArray[np.fl
     T_wc[:, :3, :] = rows.reshape(-1, 3, 4)
     R_wc = T_wc[:, :3, :3]
     error = np.abs(R_wc @ R_wc.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    bad = np.flatnonzero((error > _ROTATION_TOLERANCE) | (np.linalg.det(R_wc) < 0))
+    mirrored = np.linalg.det(R_wc) < 0
+    bad = np.flatnonzero((error > _ROTATION_TOLERANCE) | mirrored)
+    if bad.size and (error <= _ROTATION_TOLERANCE).all() and mirrored.all():
+        raise InputError(
+            f"{path}: the 3x3 part of pose 1 is not a rotation but a reflection; the poses are "
+            "mirrored (left-handed), so convert them to right-handed coordinates."
+        )
     if bad.size:
         raise InputError(
             f"{path}: the 3x3 part of pose {bad[0] + 1} is not a rotation; "

@@ -27,14 +27,14 @@ def evaluate_files(
         Path,
         typer.Argument(
             metavar="RUN|FILE",
-            help="Folder of a run, or a trajectory in the format of KITTI or TUM.",
+            help="Folder of a run, or a trajectory in the format of KITTI, TUM or EuRoC.",
         ),
     ],
     gt: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Ground truth in the format of KITTI or TUM.",
+            help="Ground truth in the format of KITTI, TUM or EuRoC.",
             show_default="the ground truth of the run",
         ),
     ] = None,
@@ -50,7 +50,8 @@ def evaluate_files(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="times.txt of the sequence. It is needed to compare a KITTI file with a TUM file.",
+            help="times.txt of the sequence. It is needed to compare a KITTI file with a file of "
+            "another format.",
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
@@ -61,14 +62,21 @@ def evaluate_files(
     """
     import json
 
-    from vslam.cli.tables import print_rows
-    from vslam.evaluation.trajectories import evaluate_trajectory, evo_command, read_pair
-    from vslam.trajectory import trajectory_format
+    from vslam.cli.tables import show_sections
+    from vslam.evaluation.trajectories import (
+        command_of_evo,
+        evaluate_trajectory,
+        evaluation_warnings,
+        read_pair,
+    )
+    from vslam.report.page import Alert, Pairs, Section
+    from vslam.run.outcome import alignment_of
 
     alignment: str = align or "se3"
+    sensor = None
     if estimate.is_dir():
-        estimate, gt, of_run = _files_of_run(estimate, gt, times)
-        alignment = align or of_run
+        estimate, gt, sensor = _files_of_run(estimate, gt, times)
+        alignment = align or alignment_of(sensor)
     elif gt is None:
         raise InputError(
             f"{estimate}: give its ground truth with --gt, or give the folder of a run that has "
@@ -76,8 +84,9 @@ def evaluate_files(
         )
     trajectory, ground_truth = read_pair(estimate, gt, times)
     evaluation = evaluate_trajectory(trajectory, ground_truth, alignment)
+    warnings = evaluation_warnings(evaluation, sensor)
     if as_json:
-        typer.echo(json.dumps(evaluation.summary(), indent=2))
+        typer.echo(json.dumps(evaluation.summary() | {"warnings": warnings}, indent=2))
         return
     matched = f"{evaluation.frames} of {len(trajectory)} have a ground truth"
     rows = [
@@ -92,18 +101,15 @@ def evaluate_files(
     else:
         rows.append(("t_rel", f"{evaluation.t_rel_percent:.3f} %"))
         rows.append(("r_rel", f"{evaluation.r_rel_deg_per_100m:.3f} deg/100 m"))
-    # evo compares only files of the same format. It cannot align straight trajectories.
-    format_ = trajectory_format(gt)
-    if format_ == trajectory_format(estimate) and not evaluation.on_one_line:
-        rows.append(("reproduce", evo_command(estimate, gt, alignment, format_)))
-    print_rows(rows)
+    if (command := command_of_evo(estimate, gt, evaluation)) is not None:
+        rows.append(("reproduce", command))
+    alerts = [Alert(f"Warning: {warning}") for warning in warnings]
+    show_sections([Section("", [*alerts, Pairs(rows)])])
 
 
 def _files_of_run(folder: Path, gt: Path | None, times: Path | None) -> tuple[Path, Path, str]:
-    """Return the files of the trajectory and of the ground truth of a run, and the alignment. Both
-    files have the same format."""
+    """Return the files of the trajectory and of the ground truth of a run, and its sensor."""
     from vslam.report.schema import ReportJson
-    from vslam.run.outcome import alignment_of
     from vslam.trajectory import trajectory_format
 
     report = ReportJson.read(folder / "report.json")
@@ -111,6 +117,6 @@ def _files_of_run(folder: Path, gt: Path | None, times: Path | None) -> tuple[Pa
     gt = gt or next((file for file in written if file.exists()), None)
     if gt is None:
         raise InputError(f"{folder}: this run had no ground truth; give one with --gt.")
-    with_times = times is not None or trajectory_format(gt) == "tum"
+    with_times = times is not None or trajectory_format(gt) != "kitti"
     name = "trajectory.tum" if with_times else "trajectory_kitti.txt"
-    return folder / name, gt, alignment_of(report.sensor)
+    return folder / name, gt, report.sensor

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.trajectory import Trajectory
-
-_log = logging.getLogger(__name__)
+from vslam.errors import InputError
+from vslam.trajectory import Trajectory, could_be_seconds, read_trajectory, trajectory_format
 
 DEPTH_NEAR_S = 0.02
 """Upper limit of the seconds between an image and its depth, as in TUM's associate.py."""
 
+MAX_TIME_DIFFERENCE_S = 0.01
+"""Upper limit of the seconds between a frame and a pose of the ground truth that is used for it
+without interpolation, as in evo."""
+
+# Times in seconds since 1970 that are closer than this are equal but for rounding.
+_SAME_TIME_S = 1e-6
 # Longest gap in the ground truth across which poses are interpolated. Ground truth comes at 100 Hz
 # (TUM), 200 Hz (EuRoC) or 10 Hz (vehicles). At an acceleration of 2 m/s^2, linear interpolation is
 # off by 6 mm in the middle of this gap.
@@ -282,37 +287,142 @@ class Pairing:
 
 
 def poses_at(
-    source: Path, measured: Trajectory, times: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
-    """Interpolate the poses of the ground truth at given times.
+    truth: Trajectory, times: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the poses of a ground truth at given times.
 
-    Positions are interpolated linearly, and rotations by slerp. If no time has a pose, a warning is
-    logged.
+    This is the only rule by which frames get a ground truth, in a run and in ``vslam eval``:
+
+    - A frame that has the time of a pose has this pose.
+    - A frame between two poses that are at most 0.15 s apart has an interpolated pose. Positions
+      are interpolated linearly, and rotations by slerp.
+    - Any other frame has the pose that is nearest in time, if they are less than 10 ms apart and no
+      other frame is nearer to the pose.
 
     Args:
-        source: name of the ground-truth file, for the log.
-        times: ``(N,)`` seconds.
+        times: ``(N,)`` increasing seconds.
 
     Returns:
-        ``(N, 4, 4)`` float64 ``T_wc``. A pose is NaN if its time is before the first measurement,
-        after the last one, or in a gap longer than 0.15 s. None if no time has a pose.
+        ``(N, 4, 4)`` float64 ``T_wc``, NaN for times without ground truth, and an ``(N,)`` mask of
+        the interpolated poses.
     """
     from scipy.spatial.transform import Rotation, Slerp
 
-    known = measured.timestamps
-    after = np.clip(np.searchsorted(known, times), 1, max(len(known) - 1, 1))
-    if len(known) < 2:
-        covered = np.zeros(len(times), np.bool_)
-    else:
-        near = known[after] - known[after - 1] <= _MAX_GAP_S
-        covered = near & (times >= known[0]) & (times <= known[-1])
-    if not covered.any():
-        _log.warning("%s: the ground truth covers none of the frames.", source)
-        return None
+    frames, poses, between = _match(truth.timestamps, times)
     T_wc = np.full((len(times), 4, 4), np.nan)
-    T_wc[covered] = np.eye(4)
-    turns = Rotation.from_matrix(measured.T_wc[:, :3, :3])
-    T_wc[covered, :3, :3] = Slerp(known, turns)(times[covered]).as_matrix()
-    for k in range(3):
-        T_wc[covered, k, 3] = np.interp(times[covered], known, measured.T_wc[:, k, 3])
-    return T_wc
+    T_wc[frames] = truth.T_wc[poses]
+    if between.any():
+        known, turns = truth.timestamps, Rotation.from_matrix(truth.T_wc[:, :3, :3])
+        T_wc[between] = np.eye(4)
+        T_wc[between, :3, :3] = Slerp(known, turns)(times[between]).as_matrix()
+        for k in range(3):
+            T_wc[between, k, 3] = np.interp(times[between], known, truth.T_wc[:, k, 3])
+    return T_wc, between
+
+
+def _match(
+    known: NDArray[np.float64], times: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return indices of frames and of the poses that they have, and an ``(N,)`` mask of the frames
+    that have an interpolated pose."""
+    frames, poses = associate(times, known, MAX_TIME_DIFFERENCE_S)
+    between = np.zeros(len(times), np.bool_)
+    if len(known) > 1:
+        after = np.clip(np.searchsorted(known, times), 1, len(known) - 1)
+        near = known[after] - known[after - 1] <= _MAX_GAP_S
+        between = near & (times >= known[0]) & (times <= known[-1])
+    between[frames[abs(times[frames] - known[poses]) < _SAME_TIME_S]] = False
+    kept = ~between[frames]
+    return frames[kept], poses[kept], between
+
+
+def read_ground_truth(
+    path: Path, times: NDArray[np.float64]
+) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+    """Read the ground truth of the frames of a data set, in the format of TUM or EuRoC, if any.
+
+    Args:
+        times: ``(N,)`` increasing times of the frames in seconds.
+
+    Returns:
+        The ``(N, 4, 4)`` poses of `poses_at`, or None if the file does not exist or no frame has a
+        pose. Then warnings: that no frame has a pose, or that the times of the file are read in
+        another unit.
+
+    Raises:
+        InputError: the file is malformed, or its poses have no times.
+    """
+    if not path.is_file():
+        return None, ()
+    instead = "or remove the file to run without ground truth"
+    try:
+        if trajectory_format(path) == "kitti":
+            raise InputError(f"{path}: the poses have no times; write t x y z qx qy qz qw.")
+        truth = read_trajectory(path)
+    except InputError as error:
+        raise InputError(f"{str(error).rstrip('.')}, {instead}.") from error
+    of_truth, of_frames = common_units(truth.timestamps, times)
+    warnings: tuple[str, ...] = ()
+    if of_frames == 1.0 != of_truth:
+        truth = Trajectory(of_truth * truth.timestamps, truth.T_wc)
+        warnings = (f"{path}: {said_of_unit('the ground truth', of_truth, 'the frames')}.",)
+    T_wc, _ = poses_at(truth, times)
+    if np.isfinite(T_wc).any():
+        return T_wc, warnings
+    apart = said_of_clocks("the times of the frames", times, "those of the poses", truth.timestamps)
+    return None, (f"{path}: the ground truth covers none of the frames: {apart}.",)
+
+
+_UNITS_S = {1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
+
+
+def common_units(first: NDArray[np.float64], second: NDArray[np.float64]) -> tuple[float, float]:
+    """Judge the units of two lists of times by whether the times then belong together.
+
+    Args:
+        first: ``(N,)`` increasing times.
+        second: ``(M,)`` increasing times of the same clock, perhaps in another unit.
+
+    Returns:
+        The units of both in seconds. They are 1 unless the times belong together only in other
+        units: at least half of the times of the shorter list then have a partner in the other list,
+        but hardly any if all times are read as seconds.
+    """
+
+    def partners(unit: float, other: float) -> int:
+        frames, _, between = _match(other * second, unit * first)
+        return len(frames) + int(between.sum())
+
+    as_given = partners(1.0, 1.0)
+    shorter = min(len(first), len(second))
+    if 2 * as_given >= shorter:
+        return 1.0, 1.0
+    one, other = ([u for u in _UNITS_S if could_be_seconds(u * times)] for times in (first, second))
+    # Equally good units differ by a common factor. Seconds are then most likely, or else the
+    # smallest unit.
+    pairs = sorted(product(one, other), key=lambda units: (sum(u < 1.0 for u in units), units))
+    others = [(partners(*units), units) for units in pairs]
+    most, units = max(others, key=lambda found: found[0], default=(0, (1.0, 1.0)))
+    if 2 * most < shorter or as_given > max(1, most // 10):
+        return 1.0, 1.0
+    return units
+
+
+def said_of_unit(what: str, unit: float, other: str) -> str:
+    """Say that the times of one trajectory are read in another unit than seconds."""
+    return (
+        f"the times of {what} are read as {_UNITS_S[unit]}, because only then do they agree with "
+        f"those of {other}"
+    )
+
+
+def said_of_clocks(
+    what: str, times: NDArray[np.float64], other: str, known: NDArray[np.float64]
+) -> str:
+    """Say how two lists of times without partners differ, and what to do about it."""
+    spans = [f"from {t[0]:.3f} to {t[-1]:.3f} s" for t in (times, known)]
+    said = f"{what} are {spans[0]} and {other} {spans[1]}; give both the times of one clock"
+    if times[0] <= known[-1] and known[0] <= times[-1]:
+        return said
+    later = times[0] - known[0]
+    return f"{said}, for example add {later:.3f} s to {other} if both begin together"

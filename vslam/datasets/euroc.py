@@ -9,8 +9,8 @@ FOLDER/mav0/state_groundtruth_estimate0/   optional: ground truth of the body
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence as Several
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
-from vslam.datasets.association import Pairing, pair_clocks, poses_at
+from vslam.datasets.association import Pairing, pair_clocks, read_ground_truth
 from vslam.datasets.frames import RawSource, Source
 from vslam.datasets.image_files import (
     checked_files,
@@ -37,13 +37,9 @@ from vslam.datasets.times import (
     unit_of_list,
 )
 from vslam.errors import InputError
-from vslam.trajectory import Trajectory
-
-_log = logging.getLogger(__name__)
 
 _HOME = "https://projects.asl.ethz.ch/datasets/euroc-mav/"
 _MOST_APART_NS = 5_000_000  # between the images of a pair, which are triggered together
-_POSE_COLUMNS = 8  # time, position and quaternion; further columns are ignored
 
 
 def open_euroc(
@@ -60,7 +56,7 @@ def open_euroc(
 
     A frame consists of a left and a right image whose times differ by at most 5 ms, apart from a
     constant difference between the clocks of the cameras. Images without a partner are left out.
-    The ground truth is interpolated at the times of the frames.
+    `poses_at` gives the frames their ground truth.
 
     Args:
         root: folder of the sequence, or a folder that contains several sequences.
@@ -79,11 +75,12 @@ def open_euroc(
     base, found, stamps, files, pairing, timing = _select(
         root, name, start, every, max_frames, monocular
     )
-    truth = _read_ground_truth(base, stamps)
     times = stamps.astype(np.float64) * 1e-9
+    truth, warnings = _read_ground_truth(base, times)
     raw = checked_files("euroc", found, times, truth, files, None, pairing, timing)
     sensors = calib or [base / f"cam{side}" / "sensor.yaml" for side in range(len(files))]
-    return rectified(raw, read_calibration(sensors, raw.sizes[0]))
+    source = rectified(raw, read_calibration(sensors, raw.sizes[0]))
+    return replace(source, warnings=warnings)
 
 
 def open_raw_euroc(
@@ -200,57 +197,24 @@ def _pairing(base: Path, times: list[NDArray[np.int64]], frames: NDArray[np.int6
     return pairing
 
 
-def _read_ground_truth(base: Path, stamps: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    from scipy.spatial.transform import Rotation
-
+def _read_ground_truth(
+    base: Path, times: NDArray[np.float64]
+) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+    """Return the ``(N, 4, 4)`` poses of the left camera at ``(N,)`` seconds, and warnings."""
     folder = base / "state_groundtruth_estimate0"
     path = folder / "data.csv"
-    if not path.is_file():
-        return None
-    times, rows = _read_states(path)
-    T_w_measured = np.tile(np.eye(4), (len(times), 1, 1))
-    T_w_measured[:, :3, :3] = Rotation.from_quat(rows[:, 3:], scalar_first=True).as_matrix()
-    T_w_measured[:, :3, 3] = rows[:, :3]
-    measured = Trajectory((times - times[0]) * 1e-9, T_w_measured)
-    T_w_sensor = poses_at(path, measured, (stamps - times[0]) * 1e-9)
+    T_w_sensor, warnings = read_ground_truth(path, times)
     if T_w_sensor is None:
-        return None
+        return None, warnings
     sensor = base / "cam0" / "sensor.yaml"
     if not sensor.is_file():
-        _log.warning(
-            "%s: the ground truth is not used because there is no %s with the pose of the camera.",
-            path,
-            sensor,
+        unused = (
+            f"{path}: the ground truth is not used because there is no {sensor} with the pose of "
+            "the camera."
         )
-        return None
+        return None, (*warnings, unused)
     T_body_camera = read_document(sensor).matrix("T_BS", 4, 4)
     T_body_sensor = np.eye(4)
     if (folder / "sensor.yaml").is_file():
         T_body_sensor = read_document(folder / "sensor.yaml").matrix("T_BS", 4, 4)
-    return T_w_sensor @ np.linalg.inv(T_body_sensor) @ T_body_camera
-
-
-def _read_states(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Read ``(N,)`` times in ns, and ``(N, 7)`` positions (m) and quaternions (w, x, y, z)."""
-    times, rows = [], []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        words = line.split(",")
-        try:
-            times.append(np.int64(words[0]))
-            row = [float(word) for word in words[1:_POSE_COLUMNS]]
-        except (ValueError, OverflowError):
-            row = []
-        if len(row) != _POSE_COLUMNS - 1 or not np.isfinite(row).all() or not any(row[3:]):
-            raise InputError(
-                f"{path}: line {number} is not a time (ns), a position and a quaternion; "
-                "repair it, or remove the file to run without ground truth."
-            )
-        rows.append(row)
-    if len(rows) < 2 or (np.diff(times) <= 0).any():
-        raise InputError(
-            f"{path}: the times of the ground truth do not increase; repair it, or remove the "
-            "file to run without ground truth."
-        )
-    return np.array(times), np.array(rows)
+    return T_w_sensor @ np.linalg.inv(T_body_sensor) @ T_body_camera, warnings

@@ -79,6 +79,7 @@ class _Frames:
     ground_truth: NDArray[np.float64] | None = None
     pairing: Pairing | None = None
     timing: Timing | None = None
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.seekable:
@@ -157,6 +158,7 @@ class Source(_Frames):
         timing: how the times were read, and how many frames were left out because of their times.
             For a stream, only the frames that have been read so far are counted. None if all frames
             have their recorded times.
+        warnings: what the report of a run must say about the data, in sentences.
         rectify_mask: function that rectifies an ``(H, W)`` uint8 mask of the original left images.
             None if vslam does not rectify the images.
 

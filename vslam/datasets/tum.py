@@ -2,7 +2,7 @@
 
 FOLDER/rgb.txt             a time in seconds and the file of a colour image on each line
 FOLDER/depth.txt           the same for the depth images
-FOLDER/groundtruth.txt     optional: t tx ty tz qx qy qz qw
+FOLDER/groundtruth.txt     optional: t tx ty tz qx qy qz qw, or EuRoC's columns
 FOLDER/calibration.yaml    optional: calibration of the camera (docs/howto/cameras.md)
 
 If the folder has no calibration, its name must contain freiburg1, freiburg2 or freiburg3. This part
@@ -12,6 +12,7 @@ of the name tells which of TUM's cameras recorded the images.
 from __future__ import annotations
 
 from collections.abc import Sequence as Several
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.datasets.association import DEPTH_NEAR_S, Pairing, associate, poses_at
+from vslam.datasets.association import DEPTH_NEAR_S, Pairing, associate, read_ground_truth
 from vslam.datasets.frames import Source
 from vslam.datasets.image_files import (
     checked_files,
@@ -31,7 +32,6 @@ from vslam.datasets.image_files import (
 from vslam.datasets.rectified import rectified
 from vslam.datasets.times import FIX_LIST, UNITS, Timing, ordered_list, unit_of_list
 from vslam.errors import InputError
-from vslam.trajectory import read_trajectory
 
 _HOME = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset"
 CALIBRATION = "calibration.yaml"
@@ -62,7 +62,7 @@ def open_tum(
     """Open a sequence of TUM. Its images are undistorted when they are read.
 
     A frame consists of a colour image and a depth image that are less than 20 ms apart, paired as
-    TUM's ``associate.py`` does. The ground truth is interpolated at the times of the frames.
+    TUM's ``associate.py`` does. `poses_at` gives them their ground truth.
 
     Args:
         root: folder of the sequence, or a folder that contains several sequences.
@@ -113,16 +113,14 @@ def open_tum(
     colour = tuple(colour_files[k] for k in frames[chosen])
     calibration = _calibration(folder, calib, image_size(colour[0]))
     found, truth_file = folder.resolve().name, folder / "groundtruth.txt"
-    truth = (
-        poses_at(truth_file, read_trajectory(truth_file), times) if truth_file.is_file() else None
-    )
+    truth, warnings = read_ground_truth(truth_file, times)
     if monocular:
         raw = checked_files("tum", found, times, truth, [colour], timing=timing)
     else:
         depth = tuple(depth_files[k] for k in partners[chosen])
         scale = depth_scale or calibration.depth_scale or _DEPTH_SCALE
         raw = checked_files("tum", found, times, truth, [colour, depth], scale, pairing, timing)
-    return rectified(raw, calibration)
+    return replace(rectified(raw, calibration), warnings=warnings)
 
 
 def is_tum(folder: Path) -> bool:

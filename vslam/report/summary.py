@@ -16,7 +16,12 @@ from vslam.config import changed_thresholds
 from vslam.errors import InputError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.map_alignment import error_in_map
-from vslam.evaluation.trajectories import Evaluation, ate_rmse, evaluate_trajectory
+from vslam.evaluation.trajectories import (
+    Evaluation,
+    ate_rmse,
+    evaluate_trajectory,
+    evaluation_warnings,
+)
 from vslam.features import TrackingState, TrackResult
 from vslam.geometry import inverses
 from vslam.loops import LoopCorrection
@@ -38,9 +43,6 @@ _OPTIONS = (
     "perturb", "detector", "seed", "threads", "start", "every", "max_frames", "weights",
     "local_weights", "realtime", "calib", "mask", "gps", "localize", "compare",
 )  # fmt: skip
-
-_WRONG_SCALE = 1.2  # smallest factor that is reported; drift changes the scale by a few per cent
-_LEFT_OVER = 0.3  # largest share of the error, and of the size of the path, after scaling
 
 
 def summarize(
@@ -75,7 +77,7 @@ def summarize(
         left_out_frames=outcome.n_left_out,
         dropped_frames=states[TrackingState.DROPPED],
         frames=frames,
-        warnings=(*outcome.warnings, *_scale_warnings(outcome, evaluation)),
+        warnings=(*outcome.warnings, *evaluation_warnings(evaluation, source.camera.sensor)),
         alignment=evaluation.alignment if evaluation else None,
         ate_mean_m=evaluation.ate_mean_m if evaluation else None,
         ate_max_m=evaluation.ate_max_m if evaluation else None,
@@ -108,30 +110,6 @@ def summarize(
         thresholds=changed_thresholds(settings["thresholds"]),
         **{name: settings[name] for name in _OPTIONS},
     )
-
-
-def _scale_warnings(outcome: RunOutcome, evaluation: Evaluation | None) -> list[str]:
-    """Return a warning if the sensor measures the scale, but the trajectory fits the ground truth
-    only after it is scaled."""
-    camera, ground_truth = outcome.sequence.camera, outcome.ground_truth
-    if evaluation is None or ground_truth is None or camera.monocular:
-        return []
-    estimate, truth = (
-        T_wc[:, :3, 3] - T_wc[:, :3, 3].mean(axis=0)
-        for T_wc in (evaluation.T_wc_aligned, ground_truth.T_wc)
-    )
-    scale = float(np.sum(estimate * truth) / max(np.sum(estimate**2), 1e-12))
-    error, size, left = (
-        np.linalg.norm(x) for x in (truth - estimate, truth, truth - scale * estimate)
-    )
-    if 1.0 / _WRONG_SCALE < scale < _WRONG_SCALE or left > _LEFT_OVER * min(error, size):
-        return []
-    what = (
-        "the depth scale (--depth-scale)"
-        if camera.depth
-        else "the baseline, and that the calibration is for images of this size"
-    )
-    return [f"the trajectory is {1.0 / scale:.2g} times as large as the ground truth: check {what}"]
 
 
 def _lost_before_map(outcome: RunOutcome) -> int:

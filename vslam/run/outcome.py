@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.datasets.association import poses_at
 from vslam.datasets.frames import Source
 from vslam.features import TrackingState, TrackResult
 from vslam.loops import LoopCorrection, LoopEdge
@@ -136,9 +137,15 @@ def odometry_trajectory(tracks: list[TrackResult]) -> Trajectory:
 
 def ground_truth_of(source: Source) -> Trajectory | None:
     """Return the true poses of the camera as mounted for all frames with ground truth. None if the
-    source has no ground truth."""
+    source has no ground truth.
+
+    A frame without a pose gets one if `poses_at` finds it between the poses of other frames.
+    """
     if source.ground_truth is None:
         return None
     known = np.flatnonzero(np.isfinite(source.ground_truth).all((1, 2)))
     T_wc = source.camera.as_mounted(source.ground_truth)
+    if 0 < len(known) < len(T_wc):
+        T_wc, _ = poses_at(Trajectory(source.timestamps, T_wc).select(known), source.timestamps)
+        known = np.flatnonzero(np.isfinite(T_wc).all((1, 2)))
     return Trajectory(source.timestamps, T_wc).select(known)

@@ -365,6 +365,7 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
 def _source_warnings(source: Source, run: _Run) -> list[str]:
     times = np.array([track.timestamp for track in run.tracks])
     return [
+        *source.warnings,
         *(source.pairing.warnings() if source.pairing is not None else []),
         *(source.timing.warnings() if source.timing is not None else []),
         *jitter_warnings(times, source.name),

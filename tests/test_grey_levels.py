@@ -77,14 +77,40 @@ def test_the_levels_do_not_depend_on_which_frames_are_selected(folder, kind):
     assert np.array_equal(part, whole[7])
 
 
+def write_deep_video(path, images: list[np.ndarray]) -> None:
+    height, width = images[0].shape
+    grey = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
+    codec = cv2.VideoWriter_fourcc(*"FFV1")
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, codec, 10.0, (width, height), grey)
+    assert writer.isOpened()
+    for image in images:
+        writer.write(image)
+    writer.release()
+
+
+def test_a_video_with_sixteen_bits(folder, corridor, sides, tmp_path):
+    both = [np.hstack(pair) for pair in zip(*sides.values(), strict=True)]
+    write_deep_video(tmp_path / "deep.mkv", both)
+    given = SourceOptions(calib=(folder / "stereo.yaml",), side_by_side=True)
+    frames = [f.read(map) for f in open_from("video", tmp_path / "deep.mkv", given).frames()]
+    expected = [frame.read(map) for frame in opened(folder, "images").frames()]
+    assert len(frames) == N
+    for found, wanted in zip(frames, expected, strict=True):
+        np.testing.assert_allclose(found, wanted, atol=8)  # other frames were sampled
+    assert len({int(image[0, 0]) for pair in frames for image in pair}) == 1
+
+
 def test_calibration_reads_the_same_images(folder):
     raw = open_raw(SourceOptions(data=str(folder), dataset="images", max_frames=1))
     assert np.array_equal(raw.read(0), opened(folder, "images").read(0))
 
 
 def test_the_full_range_keeps_its_upper_bits(corridor, tmp_path):
-    images = [image.astype(np.uint16) << 8 | 77 for image in corridor.left[:2]]
-    write_images(tmp_path, {"left": images, "right": images}, ["000000.png", "000001.png"])
+    full = {
+        side: [image.astype(np.uint16) << 8 | 77 for image in images[:2]]
+        for side, images in (("left", corridor.left), ("right", corridor.right))
+    }
+    write_images(tmp_path, full, ["000000.png", "000001.png"])
     write_calibration(tmp_path / "stereo.yaml", corridor.camera)
     source = opened(tmp_path, "images")
     assert np.array_equal(source.read(0)[0], corridor.left[0])
@@ -92,9 +118,11 @@ def test_the_full_range_keeps_its_upper_bits(corridor, tmp_path):
 
 
 def test_colours_with_sixteen_bits(corridor, tmp_path):
-    tinted = np.stack([deep(corridor.left[0], step=step) for step in (2, 4, 6)], axis=-1)
-    names = {"left": [tinted], "right": [tinted]}
-    write_images(tmp_path, names, ["000000.tiff"])
+    tinted = {
+        side: [np.stack([deep(image, step=step) for step in (2, 4, 6)], axis=-1)]
+        for side, image in (("left", corridor.left[0]), ("right", corridor.right[0]))
+    }
+    write_images(tmp_path, tinted, ["000000.tiff"])
     write_calibration(tmp_path / "stereo.yaml", corridor.camera)
     frame = opened(tmp_path, "images").stored[0]
     colour, grey = frame.colour(), frame.read(map)[0]

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Image, ImageMap
 from vslam.datasets.frames import RawSource, Size, TimedFrame
+from vslam.datasets.grey_levels import Levels, levels_of
 from vslam.errors import BrokenSourceError, InputError
 from vslam.untrusted import MOST_PIXELS
 
@@ -30,6 +31,8 @@ Capture = Any  # cv2.VideoCapture, which has no types
 _TIMEOUT_MS = 10_000  # for a camera at a URL
 _DEVICES = Path("/dev")
 _CONVERT = "convert the video, for example with ffmpeg -i VIDEO -c:v libx264 -crf 12 NEW.mp4"
+_GREY_16_BITS = int.from_bytes(b"Y1\x00\x10", "little")  # FFmpeg's pixel format gray16le
+_SAMPLES = 8  # images in which the range of the grey values is measured
 _SAME_RATE = 0.02  # relative; 30 and 29.97 frames per second count as the same rate
 # Share of the frames that may be missing at the end without an error. The number of frames that a
 # container states is only an estimate.
@@ -157,11 +160,14 @@ def open_video(
             own_fps,
         )
     n = int(count) if count >= 1 else None
+    levels = levels_of(image for _, image in first)
+    if levels is not None:
+        levels = levels_of(_spread(path, n or 1))
     return RawSource(
         dataset="video",
         name=path.stem,
         sizes=sizes_of(first[0][1], side_by_side, monocular),
-        play=partial(_play, path, n, fps, side_by_side, monocular),
+        play=partial(_play, path, n, fps, side_by_side, monocular, levels),
         n_expected=n,
     )
 
@@ -175,11 +181,17 @@ def _check_sides(source: str, side_by_side: bool, monocular: bool) -> None:
 
 
 def _play(
-    path: Path, n_expected: int | None, fps: float | None, side_by_side: bool, monocular: bool
+    path: Path,
+    n_expected: int | None,
+    fps: float | None,
+    side_by_side: bool,
+    monocular: bool,
+    levels: Levels | None,
 ) -> Iterator[TimedFrame]:
     n = 0
     for timestamp, image in _images(_open(path)):
         timestamp = timestamp if fps is None else n / fps
+        image = image if levels is None else levels[image]
         yield TimedFrame(
             timestamp,
             partial(read_sides, image, side_by_side, monocular),
@@ -193,14 +205,34 @@ def _play(
 
 
 def _open(path: Path) -> Capture:
+    import cv2
+
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a video with --data.")
     capture = open_capture(str(path))
+    if capture is not None and capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT) == _GREY_16_BITS:
+        capture.release()  # OpenCV would convert the images to 8 bits
+        capture = open_capture(str(path), cv2.CAP_PROP_CONVERT_RGB, 0)
     if capture is None:
         raise InputError(
             f"{path}: not a video, truncated, or in a codec unknown to OpenCV's FFmpeg; {_CONVERT}."
         )
     return capture
+
+
+def _spread(path: Path, n: int) -> Iterator[NDArray[Any]]:
+    """Yield images that are spread over a video of about ``n`` frames."""
+    import cv2
+
+    capture = _open(path)
+    try:
+        for k in np.unique(np.linspace(0, n - 1, _SAMPLES).astype(int)).tolist():
+            capture.set(cv2.CAP_PROP_POS_FRAMES, k)
+            decoded, image = capture.read()
+            if decoded:
+                yield image
+    finally:
+        capture.release()
 
 
 def _images(capture: Capture) -> Iterator[tuple[float, Image]]:

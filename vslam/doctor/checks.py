@@ -133,6 +133,7 @@ def check_calibration(camera: Camera) -> Finding:
     measured = (
         f"principal point ({camera.cx:.1f}, {camera.cy:.1f}), focal lengths ({camera.fx:.1f}, "
         f"{camera.fy:.1f}) for {camera.width}x{camera.height} images"
+        f"{', turned by 90 degrees' if camera.quarter_turns else ''}"
     )
     return judge(
         "calibration",

@@ -26,7 +26,7 @@ FOLDERS = {
 # its name. Names on one level may not import each other, except as listed in SIBLINGS.
 LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.errors", "vslam.machine", "vslam.method", "vslam.workers"),
-    ("vslam.kernels", "vslam.plugins", "vslam.untrusted", "vslam.lock_file"),
+    ("vslam.kernels", "vslam.plugins", "vslam.untrusted", "vslam.lock_file", "vslam.file_kinds"),
     ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.camera"),
     ("vslam.odometry",),
     ("vslam.features",),

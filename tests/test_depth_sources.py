@@ -66,6 +66,68 @@ def refused(match: str, data: Path, calib: Path, **options):
     assert str(caught.value).endswith(".")
 
 
+def write_depth(folder: Path, metres: list[np.ndarray], suffix: str) -> None:
+    folder.mkdir(exist_ok=True)
+    for k, image in enumerate(metres):
+        path = folder / f"{k}{suffix}"
+        if suffix == ".npy":
+            np.save(path, image)
+        else:
+            assert cv2.imwrite(str(path), image)
+
+
+@pytest.mark.parametrize("suffix", [".tiff", ".pfm", ".npy"])
+def test_floating_point_depth_is_in_metres(corridor, depths, calib, tmp_path, suffix):
+    metres = [(0.001 * depth).astype(np.float32) for depth in depths[:2]]
+    for k, unknown in enumerate((np.nan, np.inf, -np.inf)):
+        metres[1][0, k] = unknown
+    write_images(tmp_path, {"rgb": corridor.left[:2]}, NAMES[:2])
+    write_depth(tmp_path / "depth", metres, suffix)
+    source = opened(tmp_path, calib, fps=10.0)
+    assert source.camera.depth
+    np.testing.assert_array_equal(source.read(0)[1], metres[0])
+    np.testing.assert_array_equal(source.read(1)[1][0, :4], [0, 0, 0, metres[1][0, 3]])
+    scaled = opened(tmp_path, calib, fps=10.0, depth_scale=2.0).read(0)[1]
+    np.testing.assert_array_equal(scaled, metres[0] / 2)
+
+
+def test_the_scale_of_a_calibration_is_that_of_integers(corridor, depths, tmp_path):
+    path = write_calibration(tmp_path / "left.yaml", corridor.camera, mono=True)
+    calib = with_baseline(path, corridor.camera, ', "depth_scale": 1000')
+    write_images(tmp_path, {"rgb": corridor.left[:2]}, NAMES[:2])
+    for suffix, images in ((".tiff", depths[:2]), (".tiff", [0.001 * d for d in depths[:2]])):
+        write_depth(tmp_path / "depth", images, suffix)
+        found = opened(tmp_path, calib, fps=10.0).read(1)[1]
+        np.testing.assert_allclose(found, 0.001 * depths[1], rtol=1e-6)
+
+
+def test_floating_point_depth_in_lists(corridor, depths, tmp_path):
+    path = write_calibration(tmp_path / "calibration.yaml", corridor.camera, mono=True)
+    with_baseline(path, corridor.camera)
+    metres = [(0.001 * depth).astype(np.float32) for depth in depths[:2]]
+    write_images(tmp_path, {"rgb": corridor.left[:2]}, NAMES[:2])
+    write_depth(tmp_path / "depth", metres, ".tiff")
+    for name, suffix in (("rgb", ".png"), ("depth", ".tiff")):
+        lines = "".join(f"{k / 10},{name}\\{k}{suffix}\r\n" for k in range(2))
+        text = f"timestamp,filename\r\n{lines}"
+        (tmp_path / f"{name}.txt").write_bytes(
+            text.encode("utf-16" if name == "rgb" else "utf-8-sig")
+        )
+    np.testing.assert_array_equal(opened(tmp_path).read(1)[1], metres[1])
+
+
+def test_depth_that_is_no_depth(corridor, depths, calib, tmp_path):
+    write_images(tmp_path, {"rgb": corridor.left[:1]}, NAMES[:1])
+    write_depth(tmp_path / "depth", [1000.0 * depths[0].astype(np.float32)], ".tiff")
+    refused("the median depth is .* m, as if it were in millimetres; give --depth-scale 1000",
+            tmp_path, calib, fps=10.0)  # fmt: skip
+    opened(tmp_path, calib, fps=10.0, depth_scale=1.0)
+    write_depth(tmp_path / "depth", [(depths[0] >> 8).astype(np.uint8)], ".tiff")
+    refused("8 bits and 1 channels, as a picture for viewing", tmp_path, calib, fps=10.0)
+    write_depth(tmp_path / "depth", depths[:1], ".tiff")
+    refused("unit of the depth images is unknown", tmp_path, calib, fps=10.0)
+
+
 @pytest.fixture(scope="module")
 def expected(folders, calib, corridor, depths):
     source = opened(folders, calib, fps=10.0, depth_scale=1000.0)

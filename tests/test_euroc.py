@@ -243,7 +243,7 @@ def test_swapped_cameras(root):
     ("file", "text", "words"),
     [
         ("cam0/data.csv", "#\n", "empty"),
-        ("cam0/data.csv", "5 6\n", "line 1 is not a time in nanoseconds and a file name"),
+        ("cam0/data.csv", "5\n", "line 1 is not a time in nanoseconds and a file name"),
         ("cam0/data.csv", "6,a.png\n6,b.png\n", "1 of 2 times are not later"),
         ("cam0/data.csv", "9223372036854775808,a.png\n", "line 1 is not a time in nanoseconds"),
         ("cam1/data.csv", None, "left camera alone with --sensor mono"),

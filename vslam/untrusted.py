@@ -11,7 +11,7 @@ import os
 import zipfile
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from vslam.errors import InputError
 
@@ -23,6 +23,7 @@ MOST_PIXELS = 2**27
 many pixels."""
 
 _IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
+_DEPTH_SUFFIXES = {".npy", ".pfm"}
 _OPENCV_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
 _ANY_SIZE = 2**27  # bytes; any archive may unpack to this size
 _MOST_PACKED = 20  # a larger archive must have at least 1/20 of its unpacked size
@@ -37,6 +38,11 @@ damaged or encrypted, or has an unknown compression method."""
 def is_image(path: Path) -> bool:
     """Return whether a file has the suffix of an image format. Hidden files are no images."""
     return path.suffix.lower() in _IMAGE_SUFFIXES and not path.name.startswith(".")
+
+
+def is_float_depth(path: Path) -> bool:
+    """Return whether a file has the suffix of a format that often stores depth as floats."""
+    return path.suffix.lower() in _DEPTH_SUFFIXES and not path.name.startswith(".")
 
 
 def limit_images() -> None:
@@ -130,28 +136,36 @@ def _check_size(path: Path, archive: zipfile.ZipFile, what: str) -> None:
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """Read one array of an npz archive.
+    with archive.open(member) as file:
+        return read_npy(file, member.file_size, member.filename)
+
+
+def read_npy(file: IO[bytes], size: int, name: str) -> NDArray[Any]:
+    """Read the array of an npy file. Python objects (pickles) are rejected.
+
+    Args:
+        size: size of the file in bytes.
+        name: name of the file, for error messages.
 
     Raises:
-        ValueError: the member is not as long as its header says, holds Python objects, or has an
+        ValueError: the file is not as long as its header says, holds Python objects, or has an
             unknown version of the format.
     """
     import numpy as np
 
     layout = np.lib.format
     readers = {(1, 0): layout.read_array_header_1_0, (2, 0): layout.read_array_header_2_0}
-    with archive.open(member) as file:
-        version = layout.read_magic(file)
-        if version not in readers:
-            raise ValueError(f"npy format {version} in {member.filename}")
-        shape, fortran, dtype = readers[version](file)
-        if dtype.hasobject:
-            raise ValueError(f"{member.filename} holds Python objects")
-        count = 1
-        for length in shape:
-            count *= int(length)
-        if min(shape, default=0) < 0 or count * dtype.itemsize != member.file_size - file.tell():
-            raise ValueError(f"{member.filename} is not as long as its header says")
-        array = np.frombuffer(file.read(), dtype, count) if count else np.zeros(0, dtype)
+    version = layout.read_magic(file)
+    if version not in readers:
+        raise ValueError(f"npy format {version} in {name}")
+    shape, fortran, dtype = readers[version](file)
+    if dtype.hasobject:
+        raise ValueError(f"{name} holds Python objects")
+    count = 1
+    for length in shape:
+        count *= int(length)
+    if min(shape, default=0) < 0 or count * dtype.itemsize != size - file.tell():
+        raise ValueError(f"{name} is not as long as its header says")
+    array = np.frombuffer(file.read(), dtype, count) if count else np.zeros(0, dtype)
     ordered = array.reshape(shape[::-1]).T if fortran else array.reshape(shape)
     return ordered.copy()  # writable and C-contiguous

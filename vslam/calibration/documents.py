@@ -16,6 +16,7 @@ import numpy as np
 
 from vslam.calibration.models import Array
 from vslam.errors import InputError
+from vslam.file_kinds import identify, read_text
 
 _HEADER = re.compile(r"\A\ufeff?%YAML[: ]1\.\d.*\n?")
 # A file of this size takes two seconds to parse. A calibration file has about 5,000 bytes.
@@ -105,13 +106,7 @@ def read_document(path: Path) -> Document:
     import yaml
 
     try:
-        too_large = path.stat().st_size > _MOST_BYTES
-        text = "" if too_large else path.read_text("utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: the calibration is not a text file; give the YAML file with the parameters "
-            "of the cameras."
-        ) from error
+        too_large = path.stat().st_size > _MOST_BYTES and identify(path) is None
     except FileNotFoundError as error:
         raise InputError(f"{path}: the calibration is missing; give another file.") from error
     except OSError as error:
@@ -123,6 +118,7 @@ def read_document(path: Path) -> Document:
             f"{path}: is larger than {_MOST_BYTES // 1000} kB, so it is not a calibration; give "
             "another file."
         )
+    text = read_text(path, "the YAML file with the parameters of the cameras")
     if not text.strip():
         raise InputError(f"{path}: the calibration is empty; give another file.")
     if text.lstrip("\ufeff \n").startswith("<?xml"):

@@ -12,6 +12,7 @@ from vslam.datasets.image_folders import has_images
 from vslam.datasets.kitti_raw import is_kitti_raw
 from vslam.datasets.tum import is_tum
 from vslam.errors import InputError
+from vslam.file_kinds import identify, what_is_in
 from vslam.untrusted import is_image
 
 _BAG_SUFFIXES = {".bag", ".mcap", ".db3"}
@@ -75,6 +76,9 @@ def detect_dataset(data: str) -> str:
     path = Path(data)
     if path.is_file() and is_image(path):
         raise InputError(f"{data}: a single image; give its folder with --data.")
+    kind = identify(path)
+    if kind is not None and kind.fix and not kind.is_stream:
+        raise InputError(f"{data}: {kind.name}; {kind.fix}, and give the images with --data.")
     if path.is_file() and path.suffix.lower() in _ARCHIVES:
         raise InputError(f"{data}: an archive; unpack it and give the folder with --data.")
     if path.is_file() and path.suffix.lower() in _TEXTS:
@@ -84,13 +88,13 @@ def detect_dataset(data: str) -> str:
     if path.is_dir() and not any(path.iterdir()):
         raise InputError(f"{data}: the folder is empty; give another one with --data.")
     if path.exists():
-        kind = _kind_of(path)
-        if kind is not None:
-            return kind
+        dataset = _kind_of(path)
+        if dataset is not None:
+            return dataset
         looked = "; ".join(f"{what} ({kind})" for kind, what, _ in _KINDS)
         raise InputError(
-            f"{data}: not a known data set{_nearest(path)}; give its kind with --dataset. Looked "
-            f"for {looked}."
+            f"{data}: not a known data set{_nearest(path) or what_is_in(path)}; give its kind "
+            f"with --dataset. Looked for {looked}."
         )
     if data.isdecimal():
         return "camera"

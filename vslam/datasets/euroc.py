@@ -25,6 +25,7 @@ from vslam.datasets.image_files import (
     find_sequence,
     read_image_list,
     select_frames,
+    split_line,
 )
 from vslam.datasets.rectified import rectified
 from vslam.datasets.times import (
@@ -37,6 +38,7 @@ from vslam.datasets.times import (
     unit_of_list,
 )
 from vslam.errors import InputError
+from vslam.file_kinds import what_is_in
 
 _HOME = "https://projects.asl.ethz.ch/datasets/euroc-mav/"
 _MOST_APART_NS = 5_000_000  # between the images of a pair, which are triggered together
@@ -146,8 +148,9 @@ def _find(root: Path, name: str | None) -> tuple[Path, str]:
     folder = find_sequence(root, name, is_euroc)
     if folder is None:
         raise InputError(
-            f"{root}: holds no data in EuRoC's layout (no mav0/cam0/data.csv); download a sequence "
-            f"in ASL format from {_HOME}, unpack it and give its folder with --data."
+            f"{root}: holds no data in EuRoC's layout (no mav0/cam0/data.csv{what_is_in(root)}); "
+            "give the folder of a sequence with --data, or leave --dataset out; "
+            f"{_HOME} has sequences in ASL format to download."
         )
     base = folder / "mav0" if (folder / "mav0").is_dir() else folder
     return base, folder.resolve().name
@@ -157,7 +160,7 @@ def _read_list(camera: Path) -> tuple[NDArray[np.int64], list[str], Timing]:
     """Read the times (ns, increasing) and the file names of the images of a camera."""
 
     def parsed(line: str) -> tuple[Number, str]:
-        stamp, _, name = map(str.strip, line.partition(","))
+        stamp, name = split_line(line)
         number = number_of(stamp)
         if number is None or "/" in name or number > np.iinfo(np.int64).max:
             raise ValueError

@@ -22,6 +22,7 @@ from vslam.datasets.detection import is_bag
 from vslam.datasets.frames import Source
 from vslam.datasets.times import read_times
 from vslam.errors import InputError
+from vslam.file_kinds import read_text
 from vslam.trajectory import read_table
 
 # Standard deviation for receivers that do not state one. It is typical under an open sky.
@@ -184,9 +185,9 @@ def to_geodetic(enu: NDArray[np.float64], datum: NDArray[np.float64]) -> NDArray
 def _read_csv(path: Path) -> NDArray[np.float64]:
     """Return ``(M, 7)`` fixes in the format of `vslam.datasets.bag.read_fixes_of_bag`."""
     try:
-        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"--gps {path}: cannot be read as a CSV file; check the file.") from error
+        lines = list(csv.reader(read_text(path, "a CSV file of fixes").splitlines()))
+    except csv.Error as error:
+        raise InputError(f"--gps {path}: not a CSV file ({error}); check the file.") from error
     head = [name.strip().lower().lstrip("# ") for name in lines[0]] if lines else []
     column = {
         name: next((head.index(word) for word in words if word in head), None)
@@ -212,7 +213,7 @@ def _read_csv(path: Path) -> NDArray[np.float64]:
             row = [np.nan]
         if not np.isfinite(row).all():
             raise InputError(
-                f"--gps {path}: line {number} is not a fix of {len(head)} numbers; repair or "
+                f"--gps {path}: line {number} is not a fix of {len(head)} numbers; correct or "
                 "remove it."
             )
         rows.append([*row, sigma, sigma, sigma])
@@ -253,12 +254,13 @@ def _antenna_of_kitti(folder: Path) -> Sequence[float] | None:
     point = np.zeros(3)
     for path in paths:
         try:
-            lines = dict(line.split(":", 1) for line in path.read_text().splitlines() if line)
+            text = read_text(path, "a calibration of KITTI raw")
+            lines = dict(line.split(":", 1) for line in text.splitlines() if line.strip())
             R, t = (np.array(lines[name].split(), np.float64) for name in "RT")
             point = R.reshape(3, 3) @ point + t.reshape(3)
-        except (OSError, ValueError, KeyError) as error:
+        except (ValueError, KeyError) as error:
             raise InputError(
-                f"{path}: not a calibration of KITTI raw; unpack it again, or give the position "
+                f"{path}: not a calibration of KITTI raw; restore it, or give the position "
                 "of the antenna with --gps-antenna."
             ) from error
     x, y, z = point.tolist()

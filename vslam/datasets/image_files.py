@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from collections.abc import Sequence as Several
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +22,8 @@ from vslam.datasets.frames import RawSource, Size, TimedFrame, check_selection, 
 from vslam.datasets.grey_levels import Levels, decode, levels_of_files
 from vslam.datasets.times import Number, Timing
 from vslam.errors import InputError, UnreadableImageError
-from vslam.untrusted import MOST_PIXELS, is_image, require_utf8
+from vslam.file_kinds import read_text, why_not_an_image
+from vslam.untrusted import MOST_PIXELS, is_float_depth, is_image, read_npy, require_utf8
 
 # Distance in metres between the projector and the camera of a Kinect (ORB-SLAM2, section III-A).
 _VIRTUAL_BASELINE = 0.08
@@ -29,6 +32,7 @@ _VIRTUAL_BASELINE = 0.08
 # is at most 0.7 if one image is shifted by a pixel, and at most 0.3 for the pairs of KITTI, EuRoC
 # and boofcv.
 _SAME, _LEAST_DETAIL = 0.85, 2.0
+_FARTHEST_MEDIAN_M = 200.0  # of a depth image in metres
 _Time = TypeVar("_Time", bound=Number)
 
 
@@ -38,7 +42,7 @@ def checked_files(
     timestamps: NDArray[np.float64],
     ground_truth: NDArray[np.float64] | None,
     sides: Several[Several[Path]],
-    depth_scale: float | None = None,
+    depth_scale: DepthScale | None = None,
     pairing: Pairing | None = None,
     timing: Timing | None = None,
 ) -> RawSource:
@@ -53,14 +57,14 @@ def checked_files(
         ground_truth: ``(N, 4, 4)`` float64 ``T_wc`` of the left camera; None without ground truth.
         sides: one or two lists of N files. The first list contains the left images. The second list
             contains the right images or the depth images.
-        depth_scale: depth image units per metre; None if there are no depth images.
+        depth_scale: unit of the depth images; None if there are no depth images.
         pairing: how many images were paired by time; None if the images were not paired by time.
         timing: how the times were read.
 
     Raises:
         InputError: the left and the right images are the same.
         UnreadableImageError: a file is empty, the first frame cannot be decoded, or the first depth
-            image does not have 16 bits or does not have the size of the first image.
+            image is not one of depth in a known unit, or does not have the size of the first image.
     """
     for path in (path for side in sides for path in side):
         check_not_empty(path)
@@ -99,8 +103,9 @@ def checked_files(
         pairing=pairing,
         timing=timing,
     )
-    if depth:
+    if depth_scale is not None:
         source.read(0)
+        _check_unit(depth_scale, sides[1][0])
     return source
 
 
@@ -149,10 +154,13 @@ def image_size(path: Path) -> Size:
     return width, height
 
 
-def list_images(folder: Path) -> dict[str, Path]:
+def list_images(folder: Path, *, depth: bool = False) -> dict[str, Path]:
     """List the image files of a folder, sorted by name, as a dictionary from stems to files.
 
     The result is empty if there is no such folder.
+
+    Args:
+        depth: whether to list files of depth (NPY, PFM) if there are no images.
 
     Raises:
         InputError: a file name is not UTF-8, or two file names only differ in their suffixes.
@@ -160,7 +168,9 @@ def list_images(folder: Path) -> dict[str, Path]:
     if not folder.is_dir():
         return {}
     images: dict[str, Path] = {}
-    for path in filter(is_image, sorted(folder.iterdir())):
+    there = sorted(folder.iterdir())
+    wanted = is_float_depth if depth and not any(map(is_image, there)) else is_image
+    for path in filter(wanted, there):
         require_utf8(path)
         if (other := images.setdefault(path.stem, path)) is not path:
             raise InputError(
@@ -175,7 +185,8 @@ def read_image_list(
 ) -> tuple[list[_Time], list[str]]:
     """Read the times and file names of images from a text file with one image per line.
 
-    Lines that begin with # are comments. The times are in the unit and in the order of the file.
+    Lines that begin with # are comments. The first line may contain the headings of the columns.
+    The times are in the unit and in the order of the file.
 
     Args:
         parsed: function that takes a line, and returns the time and the file name of the image. It
@@ -186,29 +197,40 @@ def read_image_list(
     Raises:
         InputError: the file is missing, empty or malformed.
     """
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+    if not path.is_file():
         raise InputError(
-            f"{path}: the list of images is missing or not a text file; unpack the sequence again"
-            f"{instead and ', or '}{instead}."
-        ) from error
+            f"{path}: the list of images is missing; restore it{instead and ', or '}{instead}."
+        )
+    lines = read_text(path, "a list of images").splitlines()
     times: list[_Time] = []
     names: list[str] = []
+    headings = ""
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.startswith("#"):
+            continue
+        if not headings and not times and line.strip()[0].isalpha():
+            headings = line
             continue
         try:
             at, name = parsed(line)
         except ValueError:
             name = ""
         if not name:
-            raise InputError(f"{path}: line {number} is not {time} and a file name; repair it.")
+            raise InputError(
+                f"{path}: line {number} is not {time} and a file name ({line.strip()[:40]}); "
+                "correct it."
+            )
         times.append(at)
         names.append(name)
     if not times:
-        raise InputError(f"{path}: the list of images is empty; unpack the sequence again.")
+        raise InputError(f"{path}: the list of images is empty; restore it.")
     return times, names
+
+
+def split_line(line: str) -> tuple[str, str]:
+    """Split a line at its first spaces, comma or semicolon."""
+    first, *rest = re.split(r"[\s,;]+", line.strip(), maxsplit=1)
+    return first, "".join(rest)
 
 
 def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bool]) -> Path | None:
@@ -277,7 +299,9 @@ def check_not_empty(path: Path) -> None:
     try:
         empty = path.stat().st_size == 0
     except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
-        raise UnreadableImageError(path, "no such file; unpack the data again.") from error
+        raise UnreadableImageError(
+            path, "no such file; restore it, or correct the list or --data."
+        ) from error
     if empty:
         raise UnreadableImageError(path, "the file is empty; download it again.")
 
@@ -311,8 +335,17 @@ def read_grey(path: Path, levels: Levels | None = None) -> Image:
     except (OSError, ValueError):  # ValueError: the path has a zero byte
         decoded = None
     if decoded is None:
-        raise UnreadableImageError(path, "cannot be decoded; download the file again.")
+        raise UnreadableImageError(path, _why_not_grey(path))
     return np.asarray(decoded, np.uint8)
+
+
+def _why_not_grey(path: Path) -> str:
+    if (pixels := _decode_unchanged(path)) is not None:
+        return (
+            f"an image of {pixels.dtype} values; convert it to 8 or 16 bits, or give its folder "
+            "with --depth if these are depths."
+        )
+    return why_not_an_image(path)
 
 
 def read_colour(path: Path, levels: Levels | None = None) -> NDArray[np.uint8]:
@@ -357,23 +390,58 @@ def with_depth(camera: Camera, calibration: Calibration) -> Camera:
     return replace(camera, baseline=baseline, depth=True)
 
 
-def _read_depth(size: Size, scale: float, path: Path) -> DepthImage:
-    import cv2
+@dataclass(frozen=True)
+class DepthScale:
+    """The unit of depth images.
 
-    from vslam.datasets.png import decode_with_opencv
+    Attributes:
+        integers: units per metre of images of integers; None if it is unknown.
+        floats: units per metre of images of floating-point numbers. None takes them for metres, and
+            refuses an image that cannot be in metres.
+    """
 
-    try:
-        image = decode_with_opencv(path.read_bytes(), cv2.IMREAD_UNCHANGED)
-    except (OSError, ValueError, cv2.error):
-        image = None
+    integers: float | None
+    floats: float | None = None
+
+
+UNKNOWN_SCALE = DepthScale(None)
+
+
+def depth_scale_of(given: float | None, usual: float | None) -> DepthScale:
+    """Return the unit of depth images.
+
+    Args:
+        given: units per metre that the user gave for these images.
+        usual: units per metre of the camera's images of integers.
+    """
+    return DepthScale(given or usual, given)
+
+
+def _check_unit(scale: DepthScale, path: Path) -> None:
+    """Raise an `InputError` if floating-point depth is too large to be in metres."""
+    image = _decode_unchanged(path)
+    if image is None or image.dtype.kind != "f" or scale.floats is not None:
+        return
+    known = image[np.isfinite(image) & (image > 0)]
+    if known.size and (median := float(np.median(known))) > _FARTHEST_MEDIAN_M:
+        raise UnreadableImageError(
+            path,
+            f"the median depth is {median:.0f} m, as if it were in millimetres; give "
+            "--depth-scale 1000, or 1 if it is in metres.",
+        )
+
+
+def _read_depth(size: Size, scale: DepthScale, path: Path) -> DepthImage:
+    image = _decode_unchanged(path)
     if image is None:
-        raise UnreadableImageError(path, "cannot be decoded; download the file again.")
-    if image.dtype != np.uint16 or image.ndim != 2:
+        raise UnreadableImageError(path, why_not_an_image(path))
+    if image.ndim != 2 or (image.dtype.kind != "f" and image.dtype.itemsize == 1):
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise UnreadableImageError(
             path,
-            f"the depth has {8 * image.dtype.itemsize} bits and {channels} channels, but must have "
-            "16 bits and one channel; take the original.",
+            f"the depth has {8 * image.dtype.itemsize} bits and {channels} channels, as a picture "
+            "for viewing has; give the depth itself, as 16-bit integers or as floats of one "
+            "channel.",
         )
     if image.shape != size[::-1]:
         raise UnreadableImageError(
@@ -381,4 +449,29 @@ def _read_depth(size: Size, scale: float, path: Path) -> DepthImage:
             f"the depth has {size_text(image.shape)} pixels but the colour image has "
             f"{size[0]}x{size[1]}; take depth that is registered to the colour images.",
         )
-    return np.asarray(image, np.uint16) * np.float32(1.0 / scale)
+    if image.dtype.kind == "f":
+        metres = image.astype(np.float32) * np.float32(1.0 / (scale.floats or 1.0))
+        return np.where(np.isfinite(metres), metres, np.float32(0.0))
+    if scale.integers is None:
+        raise UnreadableImageError(
+            path,
+            "the unit of the depth images is unknown; give --depth-scale, 1000 for millimetres, or "
+            "depth_scale in the calibration.",
+        )
+    return image.astype(np.float32) * np.float32(1.0 / scale.integers)
+
+
+def _decode_unchanged(path: Path) -> NDArray[Any] | None:
+    """Decode an image or NPY file without changing its values; None if it cannot be decoded."""
+    import cv2
+
+    from vslam.datasets.png import decode_with_opencv
+
+    try:
+        data = path.read_bytes()
+        if path.suffix.lower() == ".npy":
+            image = np.squeeze(read_npy(BytesIO(data), len(data), path.name))
+            return image if image.ndim in (2, 3) and image.dtype.kind in "uif" else None
+        return decode_with_opencv(data, cv2.IMREAD_UNCHANGED)
+    except (OSError, ValueError, cv2.error):
+        return None

@@ -34,6 +34,8 @@ from numpy.typing import NDArray
 from vslam.datasets.association import DEPTH_NEAR_S, Pairing, associate
 from vslam.datasets.frames import RawSource
 from vslam.datasets.image_files import (
+    UNKNOWN_SCALE,
+    DepthScale,
     checked_files,
     image_size,
     list_images,
@@ -48,6 +50,7 @@ from vslam.datasets.times import (
     times_of_names,
 )
 from vslam.errors import InputError
+from vslam.file_kinds import identify, what_is_in
 
 PAIRS = (
     ("left", "right"),
@@ -97,21 +100,16 @@ class ImageFolders:
     pairing: Pairing | None = None
     timing: Timing | None = None
 
-    def source(self, depth_scale: float | None) -> RawSource:
+    def source(self, depth_scale: DepthScale = UNKNOWN_SCALE) -> RawSource:
         """Make a source of the images.
 
         Args:
-            depth_scale: depth image units per metre. It is needed only for depth images.
+            depth_scale: unit of the depth images, if there are any.
 
         Raises:
-            InputError: there are depth images but no scale.
-            UnreadableImageError: a file is empty, or the first frame cannot be decoded.
+            UnreadableImageError: a file is empty, the first frame cannot be decoded, or the unit of
+                its depth is unknown.
         """
-        if self.depth and depth_scale is None:
-            raise InputError(
-                f"{self.sides[1][0].parent}: the unit of the depth images is unknown; give "
-                "--depth-scale, 1000 for millimetres, or depth_scale in the calibration."
-            )
         scale = depth_scale if self.depth else None
         return checked_files(
             "images", self.name, self.timestamps, None, self.sides, scale, self.pairing, self.timing
@@ -173,8 +171,7 @@ def _find_sides(
     folder: Path, right: Path | None, depth: Path | None, sensor: str | None
 ) -> tuple[list[Path], list[dict[str, Path]], bool]:
     """Return the folder and the images of each side, and whether the second side is depth."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give a folder of images with --data.")
+    _require_folder(folder)
     if right is not None and depth is not None:
         raise InputError(f"--depth {depth}: contradicts --right; leave one of them out.")
     for second in (right, depth):
@@ -184,13 +181,16 @@ def _find_sides(
                     f"--{'depth' if second is depth else 'right'} {second}: is also the folder of "
                     "--data; give the folder of the other images, or leave the option out."
                 )
-            return [folder, second], [_images(folder), _images(second)], second is depth
+            is_depth = second is depth
+            images = [_images(folder), _images(second, depth=is_depth)]
+            return [folder, second], images, is_depth
     wanted = [(names, False) for names in PAIRS if sensor != "rgbd"]
     wanted += [(names, True) for names in DEPTH_PAIRS if sensor != "stereo"]
     n = 1 if sensor == "mono" else 2
     for names, is_depth in wanted:
         pair = [folder / name for name in names[:n]]
-        if all(images := [list_images(side) for side in pair]):
+        images = [list_images(side, depth=is_depth and k == 1) for k, side in enumerate(pair)]
+        if all(images):
             return pair, images, is_depth and n == 2
     together = list_images(folder)
     if (found := sides_by_name(list(together), sensor)) is not None:
@@ -208,6 +208,15 @@ def _find_sides(
     return [folder], [_images(folder)], False
 
 
+def _require_folder(folder: Path) -> None:
+    if folder.is_dir():
+        return
+    kind = identify(folder)
+    what = "no such folder" if not folder.exists() else f"{kind.name if kind else 'a file'}"
+    fix = f"{kind.fix}, and give" if kind and kind.fix else "give"
+    raise InputError(f"{folder}: {what}; {fix} a folder of images.")
+
+
 def _near_miss(folder: Path) -> str:
     """Describe an incomplete or misnamed pair of folders for an error message."""
     above = folder.resolve().parent
@@ -217,14 +226,16 @@ def _near_miss(folder: Path) -> str:
         sides = [bool(list_images(folder / name)) for name in names]
         if any(sides):
             there, missing = names if sides[0] else names[::-1]
-            return f", but only {there} has images, {missing} has none"
-    return ""
+            inside = what_is_in(folder / missing)
+            return f", but only {there} has images, {missing} has none{inside}"
+    return what_is_in(folder)
 
 
-def _images(folder: Path) -> dict[str, Path]:
-    if images := list_images(folder):
+def _images(folder: Path, *, depth: bool = False) -> dict[str, Path]:
+    _require_folder(folder)
+    if images := list_images(folder, depth=depth):
         return images
-    raise InputError(f"{folder}: no images in this folder; give another.")
+    raise InputError(f"{folder}: no images in this folder{what_is_in(folder)}; give another.")
 
 
 def _sorted_images(images: dict[str, Path]) -> dict[str, Path]:

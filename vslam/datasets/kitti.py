@@ -26,6 +26,7 @@ from vslam.datasets.image_files import checked_files, list_images, select_frames
 from vslam.datasets.rectified import rectified
 from vslam.datasets.times import FIX_LIST, ordered_list, times_of_list
 from vslam.errors import InputError, UnreadableImageError
+from vslam.file_kinds import read_text, what_is_in
 from vslam.trajectory import read_kitti_poses
 
 _HOME = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php"
@@ -70,8 +71,8 @@ def open_kitti(
     stems = sorted(set().union(*listed), key=_by_number)
     if not stems:
         raise InputError(
-            f"{folder}: no images in image_0 and image_1, or in image_2 and image_3; download the "
-            f"grayscale images (22 GB) from {_HOME}."
+            f"{folder}: no images in image_0 and image_1, or in image_2 and image_3"
+            f"{what_is_in(places[0])}; add them (the grayscale images, 22 GB, are at {_HOME})."
         )
     path = folder / "times.txt"
     rows, timing = times_of_list(path, FIX_LIST)
@@ -159,10 +160,10 @@ def read_calibration(
 
 def _projections(path: Path, cameras: tuple[int, ...]) -> NDArray[np.float64]:
     """Read the ``(C, 3, 4)`` projection matrices of C cameras."""
-    try:
-        lines = [line.split() for line in path.read_text().splitlines() if line.strip()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: the calibration is missing or unreadable; {_FIX}.") from error
+    if not path.is_file():
+        raise InputError(f"{path}: the calibration is missing; {_FIX}.")
+    text = read_text(path, "a calibration of KITTI").replace(",", " ")
+    lines = [line.split() for line in text.splitlines() if line.strip()]
     keyed = {words[0].rstrip(":"): words[1:] for words in lines if words[0].endswith(":")}
     names = [f"P{k}" for k in cameras]
     try:
@@ -188,7 +189,8 @@ def _find_root(root: Path | str) -> Path:
         if (base / "sequences").is_dir():
             return base
     raise InputError(
-        f"{root}: holds no KITTI odometry data (no folder 'sequences'); download the grayscale "
+        f"{root}: holds no KITTI odometry data (no folder 'sequences'{what_is_in(root)}); give its "
+        "folder with --data, or leave --dataset out if it is other data; or download the grayscale "
         f"images (22 GB), calibration files and ground truth poses from {_HOME}, unpack them into "
         "one folder and give it with --data or $KITTI_ROOT; --dataset synthetic needs no download."
     )

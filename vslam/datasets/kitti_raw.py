@@ -27,6 +27,7 @@ from vslam.datasets.kitti import files_of_frames, find_cameras, row_numbers
 from vslam.datasets.rectified import rectified
 from vslam.datasets.times import FIX_LIST, ordered_list, times_of_list
 from vslam.errors import InputError
+from vslam.file_kinds import what_is_in
 
 _CALIBRATION = "calib_cam_to_cam.txt"
 
@@ -69,7 +70,8 @@ def open_kitti_raw(
     cameras, places, listed = find_cameras(lambda k: folder / f"image_{k:02}" / "data", monocular)
     stems = sorted(set().union(*listed))
     if not stems:
-        raise InputError(f"{places[0]}: no images in this folder; unpack the images of the drive.")
+        inside = what_is_in(places[0])
+        raise InputError(f"{places[0]}: no images in this folder{inside}; add those of the drive.")
     path = places[0].parent / "timestamps.txt"
     rows, timing = times_of_list(path, FIX_LIST)
     of_images = [rows[k] for k in row_numbers(path, stems, len(rows))]

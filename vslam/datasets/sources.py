@@ -13,7 +13,7 @@ from vslam.calibration.models import Calibration
 from vslam.datasets import open_sequence
 from vslam.datasets.detection import detect_dataset
 from vslam.datasets.frames import RawSource, Source, selected
-from vslam.datasets.image_files import list_images
+from vslam.datasets.image_files import depth_scale_of, list_images
 from vslam.datasets.kitti_raw import is_kitti_raw
 from vslam.datasets.masks import with_masks
 from vslam.datasets.rectified import rectified
@@ -127,7 +127,8 @@ def _open_images(dataset: str, options: SourceOptions) -> Source:
             max_frames=o.max_frames, sensor=o.sensor,
         )  # fmt: skip
         calibration = _calibration(dataset, o, found.size)
-        return rectified(found.source(o.depth_scale or calibration.depth_scale), calibration)
+        scale = depth_scale_of(o.depth_scale, calibration.depth_scale)
+        return rectified(found.source(scale), calibration)
     raw, own = _open_stream(dataset, o, monocular)
     return rectified(raw, _calibration(dataset, o, raw.sizes[0], own))
 
@@ -152,7 +153,7 @@ def open_raw(options: SourceOptions) -> RawSource:
         return open_images(
             Path(o.data), o.right, fps=o.fps or 1.0, start=o.start, every=o.every,
             max_frames=o.max_frames, sensor=o.sensor or ("mono" if alone else "stereo"),
-        ).source(None)  # fmt: skip
+        ).source()  # fmt: skip
     if dataset == "euroc":
         from vslam.datasets.euroc import open_raw_euroc
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError, counted
+from vslam.file_kinds import read_text
 from vslam.trajectory import read_table
 
 Number = int | float | Decimal
@@ -343,13 +344,19 @@ def read_times(path: Path) -> Times:
     Raises:
         InputError: the file is missing, empty or malformed.
     """
-    times = []
-    try:
-        for line in path.read_text().splitlines():
-            if line.strip() and not line.startswith("#"):
-                times.append(seconds_of_date(line.strip()))
-    except (OSError, ValueError):  # no list of dates
-        times = []
+    times: list[float] = []
+    for number, line in enumerate(read_text(path, "a list of times").splitlines(), start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            times.append(seconds_of_date(line.strip()))
+        except ValueError as error:
+            if not times:
+                return read_table(path, (1,), "a time in seconds")[:, 0]
+            raise InputError(
+                f"{path}: line {number} is not a date and time, unlike the lines before it; "
+                "correct it."
+            ) from error
     return np.array(times) if times else read_table(path, (1,), "a time in seconds")[:, 0]
 
 

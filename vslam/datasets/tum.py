@@ -24,14 +24,17 @@ from vslam.datasets.association import DEPTH_NEAR_S, Pairing, associate, read_gr
 from vslam.datasets.frames import Source
 from vslam.datasets.image_files import (
     checked_files,
+    depth_scale_of,
     find_sequence,
     image_size,
     read_image_list,
     select_frames,
+    split_line,
 )
 from vslam.datasets.rectified import rectified
 from vslam.datasets.times import FIX_LIST, UNITS, Timing, ordered_list, unit_of_list
 from vslam.errors import InputError
+from vslam.file_kinds import what_is_in
 
 _HOME = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset"
 CALIBRATION = "calibration.yaml"
@@ -74,7 +77,8 @@ def open_tum(
         calib: calibration file. If it is given, it is used instead of the calibration in the folder
             and instead of the calibration of TUM's cameras.
         depth_scale: depth image units per metre. If it is None, the value in the calibration is
-            used. If there is no such value, 5000 is used.
+            used. If there is no such value, 5000 is used. If it is None, depth images of
+            floating-point numbers are in metres.
 
     Raises:
         InputError: data is missing or malformed, no images form a pair, or the calibration or the
@@ -86,8 +90,9 @@ def open_tum(
     folder = find_sequence(root, name, is_tum)
     if folder is None:
         raise InputError(
-            f"{root}: holds no data in TUM's RGB-D layout (no rgb.txt); download a sequence from "
-            f"{_HOME}, unpack it and give its folder with --data."
+            f"{root}: holds no data in TUM's RGB-D layout (no rgb.txt{what_is_in(root)}); give "
+            f"the folder of a sequence with --data, or leave --dataset out; {_HOME} has sequences "
+            "to download."
         )
     times, colour_files, timing = _read_list(folder / "rgb.txt")
     frames = partners = np.arange(len(times))
@@ -118,7 +123,7 @@ def open_tum(
         raw = checked_files("tum", found, times, truth, [colour], timing=timing)
     else:
         depth = tuple(depth_files[k] for k in partners[chosen])
-        scale = depth_scale or calibration.depth_scale or _DEPTH_SCALE
+        scale = depth_scale_of(depth_scale, calibration.depth_scale or _DEPTH_SCALE)
         raw = checked_files("tum", found, times, truth, [colour, depth], scale, pairing, timing)
     return replace(rectified(raw, calibration), warnings=warnings)
 
@@ -132,10 +137,10 @@ def _read_list(path: Path) -> tuple[NDArray[np.float64], list[Path], Timing]:
     """Read the times in seconds and the files of images from ``rgb.txt`` or ``depth.txt``."""
 
     def parsed(line: str) -> tuple[float, str]:
-        time, _, name = line.strip().partition(" ")
+        time, name = split_line(line)
         if not np.isfinite(float(time)):
             raise ValueError
-        return float(time), name.strip()
+        return float(time), name.replace("\\", "/")  # written on Windows
 
     instead = "run on the colour images with --sensor mono" if path.stem == "depth" else ""
     numbers, names = read_image_list(path, parsed, "a time in seconds", instead)

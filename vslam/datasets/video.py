@@ -23,6 +23,7 @@ from vslam.camera import Image, ImageMap
 from vslam.datasets.frames import RawSource, Size, TimedFrame
 from vslam.datasets.grey_levels import Levels, levels_of
 from vslam.errors import BrokenSourceError, InputError
+from vslam.file_kinds import identify
 from vslam.untrusted import MOST_PIXELS
 
 _log = logging.getLogger(__name__)
@@ -209,6 +210,8 @@ def _open(path: Path) -> Capture:
 
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a video with --data.")
+    if (kind := identify(path)) is not None and kind.fix and not kind.is_stream:
+        raise InputError(f"{path}: {kind.name} instead of a video; {kind.fix}.")
     capture = open_capture(str(path))
     if capture is not None and capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT) == _GREY_16_BITS:
         capture.release()  # OpenCV would convert the images to 8 bits

@@ -225,6 +225,21 @@ def test_images_that_wait_too_long_for_depth_are_counted(tmp_path):
     assert pairing.left_out == list(range(8))  # at most 32 images wait
 
 
+@pytest.mark.parametrize("missing", [("rgb", 19), ("rgb", 20), ("depth", 19), ("depth", 20)])
+def test_a_frame_that_is_missing_when_the_clock_is_set_back_costs_only_its_pair(missing, tmp_path):
+    messages = [
+        (topic, SimpleNamespace(header=SimpleNamespace(stamp=Stamp(100 + k - 50 * (k >= 20), 0))))
+        for k in range(40)
+        for topic in ("rgb", "depth")
+        if (topic, k) != missing
+    ]
+    pairing = Pairing(tmp_path, "depth", 0.02, "wait")
+    pairs = list(_synchronised(iter(messages), ("rgb", "depth"), pairing))
+    assert len(pairs) == 39
+    assert all(a.header.stamp == b.header.stamp for a, b in pairs)
+    assert len(pairing.left_out) == (missing[0] == "depth")
+
+
 def test_topics_of_bags_with_depth(corridor, depths, calib, tmp_path):
     two, small = {COLOUR: corridor.left[:2], DEPTH: depths[:2]}, [d[:80] for d in depths[:2]]
     more = {"/infra/image_raw": corridor.right[:2]}

@@ -331,7 +331,10 @@ def _synchronised(
             if abs(apart) <= min(behind, tolerance):
                 pairing.n_pairs += 1
                 yield first.popleft(), second.popleft()
-            elif early is first:
+                continue
+            # After a clock was set back, the next late message is nearer to the early one.
+            is_old = len(late) > 1 and abs(stamp_of(late[1]) - stamp_of(early[0])) < abs(apart)
+            if (late if is_old else early) is first:
                 leave_out(first.popleft())
             else:
                 second.popleft()

@@ -130,7 +130,7 @@ def _select(
     times = [stamps for stamps, *_ in listed]
     timing, *others = (timing for *_, timing in listed)
     for other in others:
-        timing.remarks.extend(other.warnings())
+        timing.add(other)
     frames = _pair(cameras, times)
     pairing = None if monocular else _pairing(base, times, frames)
     chosen = frames[select_frames(base, len(frames), start, every, max_frames)]

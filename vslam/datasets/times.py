@@ -11,7 +11,7 @@ import re
 from collections import deque
 from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as Several
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal
 from itertools import pairwise
@@ -115,11 +115,10 @@ class Timing:
         """Return the remarks, and a sentence if frames are left out or the clock was set back."""
         return [*self.remarks, *([f"{self.source}: {self.measured}."] if self.measured else [])]
 
-    def between(self, first: float, last: float) -> Timing:
-        """Return what concerns the frames from one time to another (seconds)."""
-        left_out = [one for one in self.left_out if first <= one[0] <= last]
-        set_back = [one for one in self.set_back if first <= one[0] < last]
-        return replace(self, first=first, left_out=left_out, set_back=set_back)
+    def add(self, second: Timing) -> None:
+        """Add what was found in the list of the second images."""
+        self.remarks.extend(second.remarks)
+        self.set_back = self.set_back or second.set_back
 
     def restart(self) -> None:
         """Reset all counts, before a stream is read again from its beginning."""

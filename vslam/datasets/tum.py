@@ -100,7 +100,7 @@ def open_tum(
     pairing = None
     if not monocular:
         depth_times, depth_files, depth_timing = _read_list(folder / "depth.txt")
-        timing.remarks.extend(depth_timing.warnings())
+        timing.add(depth_timing)
         frames, partners = associate(times, depth_times, DEPTH_NEAR_S)
         if not len(frames):
             raise InputError(

@@ -16,6 +16,7 @@ MODULES = (
     "vslam.features",
     "vslam.trajectory",
     "vslam.map",
+    "vslam.gaps",
     "vslam.loops",
     "vslam.errors",
     "vslam.geometry",

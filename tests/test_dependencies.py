@@ -43,7 +43,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.frontend", "vslam.backend", "vslam.loopclosure", "vslam.datasets", "vslam.maps"),
     ("vslam.hypotheses",),
     ("vslam.starter", "vslam.closing"),
-    ("vslam.map_frames",),
+    ("vslam.map_frames", "vslam.gaps"),
     ("vslam.mapping", "vslam.merging"),
     ("vslam.modes",),
     ("vslam.session",),

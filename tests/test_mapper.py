@@ -51,6 +51,7 @@ class Closing:
         self.is_adjusting = False
         self.is_due = False
         self.finished = 0
+        self.closed: list[object] = []
         self._job = job
 
     def process(self, map_: Map, keyframe: int, *_: object) -> None:

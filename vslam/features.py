@@ -302,6 +302,10 @@ class TrackResult:
         T_odom_camera: ``(4, 4)`` pose from odometry, which drifts but never jumps. It is the
             identity at the first frame. None in files of older versions.
         uncertainty: covariances of the pose. None in files of older versions.
+        part: index of the part of the map in which the frame was tracked. Part 0 contains the world
+            frame, which is the first frame of a new map. If the camera was lost and no place was
+            recognised, another part begins at a predicted pose. When a loop joins two parts, the
+            later frames have the smaller index.
     """
 
     index: int
@@ -317,6 +321,16 @@ class TrackResult:
     stage_ms: dict[str, float] = field(default_factory=dict)
     T_odom_camera: NDArray[np.float64] | None = None
     uncertainty: PoseUncertainty | None = None
+    part: int = 0
+
+    @property
+    def measured(self) -> bool:
+        """Whether the pose relative to the world frame was measured at the time of tracking.
+
+        It was only predicted if the frame is lost or dropped, or belongs to a part of the map that
+        no loop had joined to part 0.
+        """
+        return self.part == 0 and self.state in (TrackingState.OK, TrackingState.WEAK)
 
     @property
     def T_map_odom(self) -> NDArray[np.float64]:

@@ -110,6 +110,15 @@ def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:
     return parts_of(submap[ends], len(submap))[submap]
 
 
+def part_of(map_: Map, closed: Sequence[LoopEdge], keyframe: int) -> int:
+    """Return the index of the part of the map that contains a keyframe (``TrackResult.part``)."""
+    restarts = map_.restarts
+    if not restarts:
+        return 0
+    first = joined_submaps(map_, closed)[keyframe]
+    return int(np.searchsorted(restarts, first, side="right"))
+
+
 def _aligned(map_: Map, closed: Sequence[LoopEdge], edge: LoopEdge) -> Matrix:
     """Compute initial poses ``T_cw`` under the hypothesis that the lost camera was carried away.
 

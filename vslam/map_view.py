@@ -73,6 +73,8 @@ class MapView:
             map has fewer than three keyframes, all of its keyframes must observe the landmark.
         patches: image patches of the local landmarks that the newest keyframes observe.
         with_patches: the landmarks that have patches, in the same order as in ``patches``.
+        part: index of the part of the map that contains the reference keyframe
+            (``TrackResult.part``).
     """
 
     reference: int = 0
@@ -84,6 +86,7 @@ class MapView:
     n_reference: int = 0
     patches: LandmarkPatches = NO_PATCHES
     with_patches: LocalMap = NO_LANDMARKS
+    part: int = 0
 
 
 def view_of(

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -34,6 +35,7 @@ from vslam.frontend.patches import (
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, inverse, orthonormalised
+from vslam.hypotheses import part_of
 from vslam.map import Map
 from vslam.map_frames import (
     LandmarkCounts,
@@ -370,7 +372,8 @@ class Mapper:
         else:
             T_cw = self.frames.pose(place.frame)
             patches = patches_of_landmarks(place, local.ids, T_cw, map_.scales)
-        self.view = view_of(map_, keyframe, local, patches, monocular=self._camera.monocular)
+        view = view_of(map_, keyframe, local, patches, monocular=self._camera.monocular)
+        self.view = replace(view, part=part_of(map_, self._closing.closed, keyframe))
         known = map_.scalars
         self.rig.disparity_offset = known.disparity_offset
         self.rig.offset_sigma = offset_sigma(known.offset_information, self._config.stereo)

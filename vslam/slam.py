@@ -23,6 +23,7 @@ from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Found, Tracker, TrackerStatus, result_of
 from vslam.frontend.tracking import TrackingContext, uncertainty_of
+from vslam.gaps import Gap, find_gaps
 from vslam.geometry import Matrix, inverse
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_verification import LearnedRelocalisation
@@ -308,7 +309,8 @@ class Slam:
         self, frame: Frame, found: Found, is_keyframe: bool, stage_ms: dict[str, float]
     ) -> TrackResult:
         camera, odometry = self.context.camera, self._odometry
-        return result_of(frame, found, is_keyframe, stage_ms, odometry, camera)
+        result = result_of(frame, found, is_keyframe, stage_ms, odometry, camera)
+        return replace(result, part=self._mapper.view.part)
 
     def _begin_map(self, frame: Frame, clock: StageClock) -> Found:
         self.rig.extract(frame, self._tracker.twist)
@@ -346,16 +348,17 @@ class Slam:
     def _record_pose(self, frame: Frame, found: Found, T_predicted: Matrix) -> PlacedFrame:
         """Record the pose of a frame, or the predicted pose if it is lost. Advance the odometry."""
         mapper, tracker = self._mapper, self._tracker
+        known = tracker.twist is not None
         if found.is_lost:
             frame.T_cw = T_predicted
-            self._follow(frame, T_predicted, None)
+            self._follow(frame, T_predicted, None, known_velocity=known)
             tracker.lose()
             return mapper.append_pose(frame, tracked=False)
         found_again = found.relocalised or tracker.status is not TrackerStatus.TRACKING
         T_moved = T_predicted if found_again else frame.T_cw
         tracker.accept(frame, found, mapper.frames)
         uncertainty = uncertainty_of(frame, self.rig.offset_sigma, self.context)
-        self._follow(frame, T_moved, *uncertainty)
+        self._follow(frame, T_moved, *uncertainty, found_again=found_again, known_velocity=known)
         return mapper.append_pose(frame, tracked=True, near=found.keyframe)
 
     def _update_map(self, frame: PlacedFrame, found: Found) -> bool:
@@ -374,7 +377,8 @@ class Slam:
         """Add a frame without images at the predicted pose. Its state is LOST or DROPPED."""
         frame = self._next_frame(Extracted.nothing(), timestamp, None)
         frame.T_cw = self._tracker.predict(timestamp, self._mapper.frames, self._mapper.view)
-        self._follow(frame, frame.T_cw, None)
+        known = self._tracker.twist is not None
+        self._follow(frame, frame.T_cw, None, known_velocity=known)
         self._mapper.append_pose(frame, tracked=False)
         if self._mapper.n_keyframes and not dropped:
             self._tracker.lose()
@@ -387,6 +391,9 @@ class Slam:
         T_cw: Matrix,
         covariance: Matrix | None,
         of_offset: Matrix | None = None,
+        *,
+        found_again: bool = False,
+        known_velocity: bool = True,
     ) -> None:
         """Advance the odometry to the next frame, before the pose of this frame is recorded.
 
@@ -394,7 +401,7 @@ class Slam:
             T_cw: ``(4, 4)`` pose of the frame, computed from the continuous motion since the last
                 frame. It differs from the pose of the frame in the map if the camera was
                 relocalised.
-            covariance, of_offset: see ``Odometry.move``.
+            covariance, of_offset, found_again, known_velocity: see ``Odometry.move``.
         """
         frames = self._mapper.frames
         T_now_last, elapsed = np.eye(4), 0.0
@@ -408,7 +415,10 @@ class Slam:
             T_now_last = T @ T_now_last @ T.T
             covariance = None if covariance is None else A @ covariance @ A.T
             of_offset = None if of_offset is None else A @ of_offset @ R.T
-        self._odometry.move(T_now_last, elapsed, covariance, of_offset)
+        self._odometry.move(
+            T_now_last, elapsed, covariance, of_offset,
+            found_again=found_again, known_velocity=known_velocity,
+        )  # fmt: skip
 
     def resume_odometry(self, last: TrackResult) -> None:
         """Continue ``T_odom_camera`` and its uncertainty after a drive was resumed.
@@ -499,3 +509,16 @@ class Slam:
         Sub-maps that closed loops have joined to the first sub-map count as part of it.
         """
         return in_first_part(self.map, self._closing.closed, self._mapper.frames.table())
+
+    def gaps(self) -> list[Gap]:
+        """Return the stretches of this drive whose poses relative to the world were not measured.
+
+        The camera was lost before each stretch, and no closed loop has joined the stretch to the
+        map since. The list also contains lost frames at the start and at the end of the drive.
+
+        Raises:
+            RuntimeError: a keyframe is being mapped. Check ``is_mapping``, or call ``finish()``.
+        """
+        config, monocular = self.context.config.pose_graph, self.context.camera.monocular
+        scale = math.exp(config.gap_scale) if monocular else 1.0
+        return find_gaps(self.map, self._closing.closed, self._mapper.frames, scale)

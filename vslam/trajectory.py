@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -324,9 +325,13 @@ def tum_line(timestamp: float, T_wc: NDArray[np.float64]) -> str:
     return _tum_lines(np.array([timestamp]), T_wc[None])
 
 
-def write_tum(path: Path | str, trajectory: Trajectory) -> None:
-    """Write a trajectory in TUM's format, with nine decimals and qw >= 0."""
-    Path(path).write_text(_tum_lines(trajectory.timestamps, trajectory.T_wc))
+def write_tum(path: Path | str, trajectory: Trajectory, remarks: Sequence[str] = ()) -> None:
+    """Write a trajectory in TUM's format, with nine decimals and qw >= 0.
+
+    Each of the remarks becomes a comment line at the top.
+    """
+    comments = "".join(f"# {remark}\n" for remark in remarks)
+    Path(path).write_text(comments + _tum_lines(trajectory.timestamps, trajectory.T_wc))
 
 
 def _tum_lines(timestamps: NDArray[np.float64], T_wc: NDArray[np.float64]) -> str:

@@ -53,12 +53,22 @@ def info(
                 f"fx {camera.fx:.1f}, fy {camera.fy:.1f}, cx {camera.cx:.1f}, cy {camera.cy:.1f}",
             ),
             *(_contents(map_, reconstruction) if map_.n_keyframes else [("keyframes", "none")]),
-            ("sub-maps", str(len({0, *map_.restarts}) if map_.n_keyframes else 0)),
+            ("sub-maps", _submaps(stored)),
             ("drives", f"{len(stored.drives)}: {', '.join(stored.drives)}"),
             ("loops", str(len(stored.loops))),
             ("detector", stored.detector.name),
         ]
     )
+
+
+def _submaps(stored: StoredMap) -> str:
+    from vslam.hypotheses import joined_submaps
+
+    if not stored.map.n_keyframes:
+        return "0"
+    n_parts = len(set(joined_submaps(stored.map, stored.loops).tolist()))
+    split = f", in {n_parts} parts that no loop has joined" if n_parts > 1 else ""
+    return f"{len({0, *stored.map.restarts})}{split}"
 
 
 def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:

@@ -6,7 +6,7 @@ import contextlib
 import re
 import shutil
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
@@ -16,9 +16,11 @@ from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.map_alignment import truth_alignment_of
 from vslam.evaluation.trajectories import Evaluation, evo_command
+from vslam.gaps import Gap
 from vslam.maps.formats import save_ply
 from vslam.maps.storage import save_map
 from vslam.report.frame_table import write_covariances, write_frames
+from vslam.report.render import csv_text
 from vslam.report.schema import ReportJson
 from vslam.report.summary import evaluate_run, gps_figures, summarize
 from vslam.run.outcome import RunOutcome, causal_trajectory, odometry_trajectory
@@ -93,8 +95,9 @@ def write_results(
     The most valuable files are written first. If a file cannot be written, the other files are
     still written. These are the files:
 
-    - trajectories: ``trajectory_kitti.txt``, ``trajectory.tum``, ``ground_truth_kitti.txt``,
-      ``keyframes.tum``, ``trajectory_causal.tum`` (poses at the time of tracking),
+    - trajectories: ``trajectory_kitti.txt``, ``trajectory.tum``, ``gaps.csv`` (the gaps of these
+      two, if there are any; ``vslam.gaps.Gap``), ``ground_truth_kitti.txt``, ``keyframes.tum``,
+      ``trajectory_causal.tum`` (poses at the time of tracking),
       ``covariance.csv`` (covariances of these poses), ``trajectory_odom.tum`` (poses from odometry,
       which never jump), and ``trajectory_<detector>.tum`` for each detector of ``--compare``. With
       GPS, ``trajectory_enu.tum``, ``trajectory_gps.csv`` and ``gps.json`` are also written;
@@ -262,7 +265,12 @@ def write_trajectories(written: Results, outcome: RunOutcome) -> None:
     with written.file("trajectory_kitti.txt") as file:
         write_kitti(file, outcome.trajectory.T_wc)
     with written.file("trajectory.tum") as file:
-        write_tum(file, outcome.trajectory)
+        write_tum(file, outcome.trajectory, outcome.gap_sentences)
+    with written.file("gaps.csv") as file:
+        file.unlink(missing_ok=True)
+        if outcome.gaps:
+            rows = [tuple(vars(gap).values()) for gap in outcome.gaps]
+            file.write_text(csv_text([tuple(one.name for one in fields(Gap)), *rows]))
     ground_truth = None
     with written.part("the ground truth"):
         ground_truth = outcome.ground_truth

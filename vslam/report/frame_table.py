@@ -21,8 +21,8 @@ def write_frames(path: Path, tracks: list[TrackResult]) -> None:
     """Write ``frames.csv``, which has a row for each frame.
 
     The columns are the timestamp (s), the tracking state, several counts, whether the frame became
-    a keyframe, standard deviations of position (m) and orientation (degrees), and the milliseconds
-    of each stage.
+    a keyframe, the part of the map (``TrackResult.part``), standard deviations of position (m) and
+    orientation (degrees), and the milliseconds of each stage.
 
     The first two standard deviations are relative to the landmarks around the camera. The other two
     are relative to the start of the drive. A field is empty if a standard deviation is unknown, or
@@ -32,14 +32,15 @@ def write_frames(path: Path, tracks: list[TrackResult]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(
-            ["frame", "timestamp", "state", *_COUNTS, "keyframe", *_SIGMAS]
+            ["frame", "timestamp", "state", *_COUNTS, "keyframe", "part", *_SIGMAS]
             + [f"{s}_ms" for s in stages]
         )
         for track in tracks:
             counts = [getattr(track, name) for name in _COUNTS]
             times = [f"{track.stage_ms[s]:.3f}" if s in track.stage_ms else "" for s in stages]
             row = [track.index, f"{track.timestamp:.6f}", track.state, *counts]
-            table.writerow([*row, int(track.is_keyframe), *_sigmas(track), *times])
+            row += [int(track.is_keyframe), track.part]
+            table.writerow([*row, *_sigmas(track), *times])
 
 
 def _sigmas(track: TrackResult) -> list[str]:

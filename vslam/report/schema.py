@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from vslam.errors import InputError
+from vslam.gaps import GapKind
 
 
 class Record(BaseModel):
@@ -148,6 +149,21 @@ class DetectorFigures(Measures):
     seconds: float
 
 
+class GapEntry(Record):
+    """A stretch of frames whose final poses relative to the world frame were not measured.
+
+    The fields are those of ``vslam.gaps.Gap``.
+    """
+
+    kind: GapKind
+    first: int
+    last: int
+    seconds: float
+    sigma_m: float | None
+    sigma_deg: float | None
+    scale: float
+
+
 class MapFigures(Record):
     """The results of localisation in the map that a run continued.
 
@@ -218,7 +234,9 @@ class ReportJson(Measures, Document):
       begins a new map counts these frames.
     - ``longest_loss_s``: longest time in seconds from a lost frame to the next tracked frame, or to
       the end.
-    - ``warnings``: sentences about problems of the images or the rig that the run has detected.
+    - ``warnings``: sentences about problems of the images or the rig that the run has detected,
+      and about ``gaps``.
+    - ``gaps``: stretches of frames whose final poses relative to the world frame were not measured.
     - ``evaluation_remark``: the reason why no errors were computed, or the number of frames that
       the errors cover.
     - ``latency_ms``: milliseconds from an image to its pose in a real-time run. None for other
@@ -260,6 +278,7 @@ class ReportJson(Measures, Document):
     keyframes: int
     landmarks: int
     submaps: int
+    gaps: tuple[GapEntry, ...] = ()
     loops_rejected: int
     revisit_stretches: int | None
     revisits: list[RevisitEntry]

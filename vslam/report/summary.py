@@ -29,6 +29,7 @@ from vslam.machine import available_cores, cpu_name, versions
 from vslam.method import METHOD_VERSION
 from vslam.report.schema import (
     DetectorFigures,
+    GapEntry,
     GpsFigures,
     LoopEntry,
     Machine,
@@ -77,7 +78,11 @@ def summarize(
         left_out_frames=outcome.n_left_out,
         dropped_frames=states[TrackingState.DROPPED],
         frames=frames,
-        warnings=(*outcome.warnings, *evaluation_warnings(evaluation, source.camera.sensor)),
+        warnings=(
+            *outcome.warnings,
+            *outcome.gap_sentences,
+            *evaluation_warnings(evaluation, source.camera.sensor),
+        ),
         alignment=evaluation.alignment if evaluation else None,
         ate_mean_m=evaluation.ate_mean_m if evaluation else None,
         ate_max_m=evaluation.ate_max_m if evaluation else None,
@@ -92,6 +97,7 @@ def summarize(
         keyframes=outcome.n_keyframes,
         landmarks=outcome.n_landmarks,
         submaps=outcome.n_submaps,
+        gaps=tuple(GapEntry(**vars(gap)) for gap in outcome.gaps),
         loops_rejected=sum(not loop.accepted for loop in loops),
         revisit_stretches=len(verdict.revisits) if verdict else None,
         revisits=_revisits(verdict) if verdict else [],

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from vslam.datasets.association import poses_at
 from vslam.datasets.frames import Source
 from vslam.features import TrackingState, TrackResult
+from vslam.gaps import Gap, sentences
 from vslam.loops import LoopCorrection, LoopEdge
 from vslam.map import Map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
@@ -62,6 +63,7 @@ class RunOutcome:
         keyframe_frames: ``(K,)`` int64, index of the frame of this run that became each keyframe.
             Culled keyframes are included. The index is -1 for keyframes of earlier drives.
         n_submaps: number of sub-maps, including the first map. 0 if the map has no keyframe.
+        gaps: stretches whose final poses relative to the world frame were not measured.
         gps_track: the georeferenced drive. None if the run has no GPS.
         interrupted: the reason why the run ended early, such as "Ctrl-C" or a truncated file.
         compared: the outcome of each loop detector in ``settings.compare``, without its map. The
@@ -91,6 +93,7 @@ class RunOutcome:
     corrections: list[LoopCorrection] = field(default_factory=list)
     keyframe_frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     n_submaps: int = 1
+    gaps: list[Gap] = field(default_factory=list)
     gps_track: GpsTrack | None = None
     interrupted: str | None = None
     step_s: float = 0.0
@@ -100,6 +103,12 @@ class RunOutcome:
     def alignment(self) -> str:
         """The kind of transformation that aligns the trajectory with the ground truth."""
         return alignment_of(self.sequence.camera.sensor)
+
+    @property
+    def gap_sentences(self) -> list[str]:
+        """Sentences about ``gaps``."""
+        unit = "map units" if self.sequence.camera.monocular else "m"
+        return sentences(self.gaps, len(self.tracks), unit)
 
     @property
     def n_tracked(self) -> int:

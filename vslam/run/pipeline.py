@@ -359,6 +359,7 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
         corrections=corrections,
         keyframe_frames=keyframe_frames,
         n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
+        gaps=slam.gaps(),
     )
 
 

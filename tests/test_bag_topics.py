@@ -7,13 +7,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from source_files import open_from
+from source_files import LEFT, RIGHT, open_from, write_bag
 
 pytest.importorskip("rosbags", reason="pip install 'vslam[bag]'")
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from vslam.calibration.formats import read_ros
+from vslam.datasets.bag import open_bag
 from vslam.datasets.bag_messages import camera_info, depth_in
 from vslam.datasets.bag_topics import camera_info_of
 from vslam.datasets.sources import SourceOptions, open_raw
@@ -227,6 +228,17 @@ def test_each_image_finds_its_camera_info(image, frames, infos, wanted):
         topic: SimpleNamespace(header=SimpleNamespace(frame_id=f)) for topic, f in infos.items()
     }
     assert camera_info_of(image, frames, sent) == wanted
+
+
+def test_a_folder_whose_metadata_name_another_encoding(tmp_path):
+    pair = {LEFT: [grey(), grey() + np.uint8(1)], RIGHT: [grey() + np.uint8(2)] * 2}
+    path = write_bag(tmp_path / "a", "ros2", pair, [10**8, 2 * 10**8])
+    file = path / "metadata.yaml"
+    text = file.read_text()
+    file.write_text(text.replace("serialization_format: cdr", "serialization_format: json", 1))
+    assert file.read_text() != text
+    frames = list(open_bag(path).frames())
+    assert np.array_equal(frames[1].read(map)[0], grey() + np.uint8(1))
 
 
 def sixteen_bits(pixels: np.ndarray, encoding: str = "mono16"):

@@ -75,9 +75,12 @@ def opened(path: Path) -> Iterator[Recording]:
             try:
                 recording = _ros_recording(path, stack)
             except Exception:  # rosbags and its parsers raise many kinds
-                if not files or not all(file.suffix.lower() == ".mcap" for file in files):
+                if files and all(file.suffix.lower() == ".mcap" for file in files):
+                    recording = _mcap_recording(files, stack)
+                elif path.is_dir() and len(files) == 1:  # metadata.yaml names another encoding
+                    recording = _ros_recording(files[0], stack)
+                else:
                     raise
-                recording = _mcap_recording(files, stack)
         except Exception as error:
             raise InputError(_unreadable(path, files, error)) from error
         yield recording

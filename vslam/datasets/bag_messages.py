@@ -26,6 +26,7 @@ Message = Any  # classes that rosbags generates from the bag's message definitio
 _COMPRESSED_DEPTH = "compressedDepth"  # format of image_transport: a 12-byte header, then a PNG
 _MM_PER_M = 1000.0  # 16-bit depth is in millimetres, 32-bit depth in metres (REP 118)
 _GAP = 20  # least distance in a depth image, in steps between its values; grey values begin near 1
+_MOST_STRAY = 1e-3  # share of pixels with depth whose value may lie in this gap nevertheless
 _FEWEST_HOLES = 1e-3  # share of pixels without depth that are surrounded by pixels with depth
 _FEWEST_KNOWN = 1e-2  # share of pixels with a value by which a 16-bit image can be judged
 _DEPTH_ENCODINGS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
@@ -258,8 +259,11 @@ def depth_in(message: Message, topic: str) -> bool | None:
     known = image > 0
     if known.mean() < _FEWEST_KNOWN:
         return None
-    levels = np.unique(image[known]).astype(np.int64)
-    if len(levels) < 2 or levels[0] < _GAP * np.diff(levels).min():
+    values, counts = np.unique(image[known], return_counts=True)
+    if len(values) < 2:
+        return False
+    in_the_gap = values < _GAP * np.diff(values).min()
+    if counts[in_the_gap].sum() > _MOST_STRAY * counts.sum():
         return False
     between = ~known
     for axis in (0, 1):

@@ -134,6 +134,14 @@ def test_the_end_that_a_bag_lacks(folder, tmp_path, kind, said):
     refused(rf"{cut}: the recording was cut off \({said}", "bag", cut, SourceOptions())
 
 
+def test_a_folder_without_metadata(folder, tmp_path):
+    refused("the folder contains no bag", "bag", tmp_path, SourceOptions())
+    shutil.copytree(source_path(folder, "ros2"), tmp_path / "a")
+    (tmp_path / "a" / "metadata.yaml").unlink()
+    shutil.copy(next((tmp_path / "a").glob("*.db3")), tmp_path / "a" / "a_1.db3")
+    refused("no metadata.yaml, .* 'ros2 bag reindex'", "bag", tmp_path / "a", SourceOptions())
+
+
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [

@@ -290,9 +290,11 @@ def _unreadable(path: Path, files: list[Path], error: Exception) -> str:
                 "the whole file again."
             )
     if path.is_dir() and not (path / "metadata.yaml").is_file():
+        if not files:
+            return f"{path}: the folder contains no bag; give a bag with --data."
         return (
-            f"{path}: the recording was cut off (it has no metadata.yaml); repair it with "
-            "'ros2 bag reindex'."
+            f"{path}: there is no metadata.yaml, which 'ros2 bag record' writes at its end; write "
+            "it with 'ros2 bag reindex', or give a file of the folder with --data."
         )
     for file in files:
         kind = file.suffix.lower()

@@ -740,6 +740,10 @@ def test_eval_of_a_run(call, tmp_path, sensor):
         code, out, err = call("eval", run, *words, "--json")
         assert code == 0, err
         assert json.loads(out)["ate_rmse_m"] == pytest.approx(report.ate_rmse_m, rel=1e-6)
+    imu = tmp_path / "state_groundtruth_estimate0/data.csv"
+    imu.parent.mkdir()
+    write_euroc(imu, truth)
+    assert "has the poses of the IMU" in call("eval", run, "--gt", imu)[1]
     (run / "ground_truth_kitti.txt").unlink()
     refused(call("eval", run), "no ground truth", "--gt")
 

@@ -251,6 +251,12 @@ def test_read_pair_mixes_formats_with_times(tmp_path):
     assert evaluate_trajectory(*read_pair(*pair, tmp_path / "times.txt")).frames == 30
     with pytest.raises(InputError, match="give its times with --times"):
         read_pair(*pair)
+    np.savetxt(tmp_path / "times.txt", 1e9 * truth.timestamps, fmt="%.0f")
+    found = evaluate_trajectory(*read_pair(*pair, tmp_path / "times.txt"))
+    assert (found.frames, len(found.warnings)) == (30, 1)
+    np.savetxt(tmp_path / "times.txt", truth.timestamps[::-1])
+    with pytest.raises(InputError, match="the times do not increase"):
+        read_pair(*pair, tmp_path / "times.txt")
 
 
 def test_read_pair_refuses_kitti_files_of_different_length(tmp_path):

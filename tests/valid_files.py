@@ -321,11 +321,12 @@ def vocabulary(folder: Path) -> None:
 
 
 def trajectories(folder: Path) -> None:
-    from vslam.trajectory import Trajectory, write_kitti, write_tum
+    from vslam.trajectory import Trajectory, write_euroc, write_kitti, write_tum
 
     T_wc = np.tile(np.eye(4), (5, 1, 1))
     write_kitti(folder / "a.kitti", T_wc)
     write_tum(folder / "a.tum", Trajectory(0.1 * np.arange(5), T_wc))
+    write_euroc(folder / "a.csv", Trajectory(0.1 * np.arange(5), T_wc))
 
 
 def onnx(folder: Path) -> None:

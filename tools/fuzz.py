@@ -215,7 +215,7 @@ def _read_vocabulary(folder: Path) -> None:
 def _read_trajectories(folder: Path) -> None:
     from vslam.trajectory import read_trajectory
 
-    _each(lambda name: read_trajectory(folder / name), ("a.kitti", "a.tum"))
+    _each(lambda name: read_trajectory(folder / name), ("a.kitti", "a.tum", "a.csv"))
 
 
 def _read_onnx(folder: Path) -> None:

@@ -85,6 +85,11 @@ def evaluate_files(
     trajectory, ground_truth = read_pair(estimate, gt, times)
     evaluation = evaluate_trajectory(trajectory, ground_truth, alignment)
     warnings = evaluation_warnings(evaluation, sensor)
+    if sensor is not None and gt.resolve().parent.name == "state_groundtruth_estimate0":
+        warnings.append(
+            f"{gt} has the poses of the IMU, and the run those of the left camera: leave out --gt "
+            "to use the ground truth of the camera"
+        )
     if as_json:
         typer.echo(json.dumps(evaluation.summary() | {"warnings": warnings}, indent=2))
         return

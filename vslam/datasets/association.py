@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.datasets.times import UNITS
 from vslam.errors import InputError
 from vslam.trajectory import Trajectory, could_be_seconds, read_trajectory, trajectory_format
 
@@ -373,7 +374,7 @@ def read_ground_truth(
     return None, (f"{path}: the ground truth covers none of the frames: {apart}.",)
 
 
-_UNITS_S = {1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}
+_UNITS_S = {1.0 / per_second: name for name, per_second in UNITS.items()}
 
 
 def common_units(first: NDArray[np.float64], second: NDArray[np.float64]) -> tuple[float, float]:

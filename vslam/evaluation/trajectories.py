@@ -21,11 +21,11 @@ from vslam.datasets.association import (
     said_of_clocks,
     said_of_unit,
 )
+from vslam.datasets.times import read_times
 from vslam.errors import InputError, counted
 from vslam.trajectory import (
     Format,
     Trajectory,
-    read_table,
     read_trajectory,
     trajectory_format,
 )
@@ -293,13 +293,13 @@ def read_pair(
     """Read an estimated trajectory and its ground truth, each in the format of KITTI, TUM or EuRoC.
 
     Args:
-        times: file with the timestamp of each frame in seconds, one per line (``times.txt``). This
+        times: file with the timestamp of each frame, one per line (``times.txt``). This
             file is needed for files in KITTI's format, which contain no timestamps.
 
     Raises:
         InputError: a file is malformed, or the files cannot be matched without timestamps.
     """
-    timestamps = None if times is None else read_table(times, (1,), "a time in seconds")[:, 0]
+    timestamps = None if times is None else read_times(Path(times))
     if timestamps is not None and (np.diff(timestamps) <= 0).any():
         raise InputError(f"{times}: the times do not increase; give the times of the frames.")
     formats = {trajectory_format(estimate), trajectory_format(ground_truth)}

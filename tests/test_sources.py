@@ -225,6 +225,13 @@ def test_times_in_names(corridor, tmp_path, names, times):
     assert np.diff(found.timestamps)[0] == pytest.approx(times[1], abs=1e-6)
 
 
+def test_names_that_may_be_numbers_need_a_rate(corridor, tmp_path):
+    write_images(tmp_path, {"": corridor.left[:3]}, ["312000.png", "312104.png", "312208.png"])
+    said = "names that may be the numbers of frames.; give --fps, 9.62 if the names are millisec"
+    with pytest.raises(InputError, match=said):
+        open_images(tmp_path, sensor="mono")
+
+
 @pytest.mark.parametrize(
     "names",
     [

@@ -117,6 +117,11 @@ def test_the_numbers_of_frames_are_no_list_of_times(numbers, usual):
         unit_of_list(numbers, HERE, usual, "give --fps")
 
 
+def test_whole_seconds_are_not_the_numbers_of_frames():
+    """A clock that counts seconds gives ten frames the same time."""
+    assert unit_of_list([k // 10 for k in range(60)], HERE, "seconds", "")[0] == "seconds"
+
+
 def test_a_list_that_no_camera_can_have_is_refused():
     with pytest.raises(InputError, match=r"here: the times increase in steps of 1e-05, .*; fix it"):
         unit_of_list([1e-5 * k for k in range(9)], HERE, "seconds", "fix it")

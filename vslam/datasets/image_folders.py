@@ -399,9 +399,15 @@ def _find_times(folder: Path, files: list[Path]) -> tuple[list[float], Timing]:
         raise InputError(f"{odd}: has no time, unlike {files[0].name}; give --fps.")
     if taken:
         return [time for time in taken if time is not None], Timing(str(folder))
+    why, example = "none in their names or EXIF", ""
+    if len(named) == len(files):
+        why = "none in EXIF, and names that may be the numbers of frames"
+        step = float(np.median(np.diff(np.array(named, np.float64)))) if len(files) > 1 else 1.0
+        if step > 1.0:
+            example = f", {1e3 / step:.3g} if the names are milliseconds"
     raise InputError(
-        f"{folder}: the images have no time stamps (no {' or '.join(_TIME_FILES)}, none in their "
-        "names or EXIF); give --fps."
+        f"{folder}: the images have no time stamps (no {' or '.join(_TIME_FILES)}, {why}); give "
+        f"--fps{example}."
     )
 
 

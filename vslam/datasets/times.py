@@ -388,8 +388,9 @@ def unit_of_list(numbers: Several[Number], path: Path, usual: str, fix: str) -> 
         InputError: the numbers count the frames, or no unit gives a frame rate that a camera can
             have.
     """
-    whole = all(number == int(number) for number in numbers)
-    if len(numbers) > _TOO_FEW and whole and max(numbers) < _NUMBERS and _interval(numbers) == 1.0:
+    whole = all(number == int(number) for number in numbers) and max(numbers) < _NUMBERS
+    by_one = sum(b - a == 1 for a, b in pairwise(numbers))  # type: ignore[operator]
+    if len(numbers) > _TOO_FEW and whole and 2 * by_one > len(numbers) - 1:
         first = ", ".join(f"{int(number)}" for number in numbers[:3])
         raise InputError(f"{path}: {first}, ... are the numbers of frames, not their times; {fix}.")
     unit, remark = _unit_of(numbers, f"{path}: the times", usual, fix)

@@ -24,7 +24,7 @@ PAGE = b"\n<!DOCTYPE html>\n<html><body>Log in</body></html>\n"
 OTHERS = {
     "a HEIC photo": (HEIC, "convert it to PNG"),
     "a pointer of Git LFS": (POINTER, "git lfs pull"),
-    "a web page": (PAGE, "download the file itself"),
+    "a web page": (PAGE, "save the file that the page links to"),
     "a file compressed with gzip": (gzip.compress(b"a"), "unpack it"),
     "an OpenEXR image": (b"\x76\x2f\x31\x01\2\0\0\0", "32-bit floats"),
     "a RAW photo": (b"II*\0\x10\0\0\0CR\2\0", "develop it"),
@@ -116,7 +116,7 @@ def test_texts_in_other_encodings(tmp_path, encoding):
     assert read_text(path, "a list") == text
     assert read_calibration([path]).left.fx == 50
     path.write_bytes(b"\0\1\2")
-    assert "not a text file; give a list" in refusal(read_text, path, "a list")
+    assert "not a text file, or damaged; give a list" in refusal(read_text, path, "a list")
     assert "cannot read the file" in refusal(read_text, tmp_path, "a list")
 
 

@@ -353,7 +353,7 @@ def test_poses_of_another_length(root):
     [
         (row(replaced(P0, 3, np.nan)), "NaN"),
         ("1 2 3", "has 3 numbers"),
-        ("one two", "not a row of numbers"),
+        ("one two", 'no numbers (it begins with "one two")'),
         (row(P0), "not a rotation"),
     ],
 )

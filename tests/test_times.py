@@ -15,6 +15,7 @@ from vslam.datasets.times import (
     jitter_warnings,
     ordered_list,
     rate_text,
+    read_times,
     times_of_names,
     unit_of_list,
 )
@@ -252,3 +253,12 @@ def test_stamps_of_arrival_are_named():
 )
 def test_a_rate_is_never_zero(interval_s, text):
     assert rate_text(interval_s) == text
+
+
+def test_a_list_of_dates_in_which_one_line_is_no_date(tmp_path):
+    path = tmp_path / "timestamps.txt"
+    path.write_text("2011-09-26 13:02:25.25\n\n2011-09-26 13:02:2x\n")
+    with pytest.raises(InputError, match="line 3 is not a date and time, unlike the lines before"):
+        read_times(path)
+    path.write_bytes("# times\r\n2011-09-26 13:02:25.25\r\n".encode("utf-16"))
+    assert read_times(path).tolist() == [1317042145.25]

@@ -190,6 +190,7 @@ def test_euroc_round_trip(tmp_path, trajectory):
         ("1,2,3,0,0,0,1\n2,2,3,0,0,0,1\n", "7 numbers (a pose without time)"),
         ("130.1 rgb/130.1.png\n", "line 1 is not a row of numbers"),
         ("a recording\nof a robot\n", "line 2 is not a row of numbers"),
+        ("<html>\n", "a web page instead of a file with a pose on each line"),
         ("a recording\n", 'has no numbers (it begins with "a recording")'),
         ("-1 0 0 0 0 1 0 0 0 0 1 0\n", "left-handed"),
         ("1 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n", "remove one of them"),
@@ -203,9 +204,7 @@ def test_a_sound_file_of_another_kind_is_not_called_damaged(tmp_path, text, part
     assert "download" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "text", ["0 1 2 3 0 0 0 1\n1 2 3\n", "0 1 2 3 0 0 0 1\n\0\0\n", "<html>\n"]
-)
+@pytest.mark.parametrize("text", ["0 1 2 3 0 0 0 1\n1 2 3\n", "0 1 2 3 0 0 0 1\n\0\0\n"])
 def test_a_file_that_is_cut_off_or_has_garbage_is_called_damaged(tmp_path, text):
     (tmp_path / "file").write_text(text)
     with pytest.raises(InputError, match="download the file again"):

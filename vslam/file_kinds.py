@@ -89,7 +89,7 @@ _KINDS: tuple[tuple[int, bytes, FileKind], ...] = (  # position and value of the
     ),
 )
 _NPZ = FileKind("an archive of NumPy arrays (NPZ)", _CONVERT)
-_WEB_PAGE = FileKind("a web page", "download the file itself, which may need a login")
+_WEB_PAGE = FileKind("a web page", "save the file that the page links to, which may need a login")
 _RAW_SUFFIXES = {".dng", ".nef", ".arw", ".pef", ".srw", ".nrw", ".3fr"}  # they begin like TIFF
 _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
          (codecs.BOM_UTF16_BE, "utf-16"))  # fmt: skip
@@ -159,5 +159,7 @@ def read_text(path: Path, wanted: str) -> str:
     except UnicodeDecodeError:
         text = data.decode("latin-1")
     if _NO_TEXT.search(text):
-        raise InputError(f"{path}: not a text file; give {wanted}.")
+        raise InputError(
+            f"{path}: not a text file, or damaged; give {wanted}, or download the file again."
+        )
     return text

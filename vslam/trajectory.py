@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
+from vslam.file_kinds import read_text
 from vslam.geometry import compose, inverse, orthonormalised, se3_exp, se3_log
 
 Format = Literal["kitti", "tum", "euroc"]
@@ -41,8 +42,6 @@ _KINDS = {
     16: " (a 4x4 matrix)",
     17: " (a state of EuRoC)",
 }
-# What a file is whose first line begins like this.
-_NOT_THE_FILE = {"<": "a web page", "version https://git-lfs": "a pointer of Git LFS"}
 _UNITS_S = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0}
 _UNIT_OF_COLUMN = re.compile(r"(?:^|[\[(_ ])(ns|us|ms|s|sec)[\])]?$")
 # Seconds from one pose to the next, and seconds since 1970, that a trajectory can have. A file
@@ -137,12 +136,7 @@ def read_table(
 def _read_table(
     path: Path | str, columns: tuple[int, ...], what: str, max_rows: int | None = None
 ) -> _Table:
-    try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the file ({error.strerror}).") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file; give one with {what} on each line.") from error
+    lines = read_text(Path(path), f"a file with {what} on each line").splitlines()
     rows: list[list[float]] = []
     names: list[str] = []
     first = ""
@@ -156,7 +150,6 @@ def _read_table(
             continue
         first = first or line.strip()
         if first == line.strip() and not any(map(_is_number, words)):
-            _refuse_other_content(path, first)
             names = _column_names(line)
             continue
         where = f"{path}: line {number}"
@@ -171,7 +164,7 @@ def _read_table(
                 f"{where} has {len(row)} numbers{kind} where {what} takes {allowed}; {fix}."
             )
         if not np.isfinite(row).all():
-            raise InputError(f"{where} holds NaN or infinity; {again}.")
+            raise InputError(f"{where} holds NaN or infinity; correct or remove the line.")
         if not rows:
             commas, whole = "," in line or ";" in line, words[0].isdecimal()
         rows.append(row)
@@ -206,12 +199,6 @@ def _column_names(line: str) -> list[str]:
     line = line.strip().lstrip("#").lower()
     names = re.split("[,;]", line) if re.search("[,;]", line) else line.split()
     return [name.strip() for name in names]
-
-
-def _refuse_other_content(path: Path | str, first: str) -> None:
-    for beginning, content in _NOT_THE_FILE.items():
-        if first.startswith(beginning):
-            raise InputError(f"{path}: holds {content}, not the data; download the file again.")
 
 
 def trajectory_format(path: Path | str) -> Format:

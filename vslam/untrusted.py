@@ -22,7 +22,18 @@ MOST_PIXELS = 2**27
 """Largest number of pixels of an image file (11,585 x 11,585). OpenCV itself allows eight times as
 many pixels."""
 
-_IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm"}
+_IMAGE_SUFFIXES = {
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".webp",
+    ".bmp",
+    ".tif",
+    ".tiff",
+    ".pgm",
+    ".ppm",
+    ".pnm",
+}
 _DEPTH_SUFFIXES = {".npy", ".pfm"}
 _OPENCV_LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
 _ANY_SIZE = 2**27  # bytes; any archive may unpack to this size

@@ -87,7 +87,7 @@ class _Frames:
         object.__setattr__(self, "n_expected", len(self.stored))
         times = self.timestamps
         if not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            raise InputError(f"{self.name}: the times of the frames do not increase; repair them.")
+            raise InputError(f"{self.name}: the times of the frames do not increase; correct them.")
         if self.ground_truth is not None and self.ground_truth.shape != (len(times), 4, 4):
             raise ValueError(f"ground_truth must be of shape ({len(times)}, 4, 4)")
 

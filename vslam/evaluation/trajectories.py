@@ -341,9 +341,12 @@ def command_of_evo(
 
 
 def _is_plain(path: Path | str) -> bool:
-    """Return whether evo can read a trajectory: its numbers are separated by spaces, and all other
-    lines are comments."""
-    lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    """Return whether evo can read a trajectory: it is ASCII, its numbers are separated by spaces,
+    and all other lines are comments."""
+    data = Path(path).read_bytes()
+    if not data.isascii():
+        return False
+    lines = data.decode("ascii").splitlines()
     first = next(line for line in lines if line.strip() and not line.startswith("#"))
     return "," not in first and ";" not in first and any(map(str.isdecimal, first.split()[0]))
 

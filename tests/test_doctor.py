@@ -24,9 +24,7 @@ from vslam.datasets.times import Timing, in_order
 from vslam.datasets.tum import open_tum
 from vslam.doctor.checks import check_depth, check_times
 from vslam.doctor.examine import examine
-from vslam.doctor.nothing_tracked import how_to_swap
 from vslam.errors import ResultsError, UnreadableImageError
-from vslam.run.options import RunOptions
 
 REAL = Path(__file__).parents[2] / "shared/data"
 FEW = as_config({"orb": {"n_features": 500}})  # for images of 480x160
@@ -176,16 +174,6 @@ def test_a_calibration_of_larger_images(clean):
     found = {f.check: f for f in examine(twice, FEW).faults}
     assert "images of twice this size" in found["calibration"].measured
     assert "--calib" in found["calibration"].fix
-
-
-@pytest.mark.parametrize(("dataset", "options", "advice"), [
-    ("images", {"data": "a", "right": "b"}, "swap them: --data b --right a"),
-    ("images", {"data": "a"}, "swap the folders of the left and the right images"),
-    ("bag", {"topics": "/a,/b"}, "swap them: --topics /b,/a"),
-    ("bag", {}, "give both topics with --topics, that of the left images first"),
-])  # fmt: skip
-def test_how_to_swap_names_only_options_that_help(dataset, options, advice):
-    assert how_to_swap(dataset, RunOptions(**options)) == advice
 
 
 def test_how_late_the_right_side_is(clean):

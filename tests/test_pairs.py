@@ -1,18 +1,23 @@
-"""Pairs of images in folders: which images belong together, and which cannot be a pair."""
+"""Pairs of images: which images belong together, and which cannot be a stereo pair."""
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from source_files import run_source
 
 from vslam.datasets.association import pair_clocks
+from vslam.datasets.frames import Source, TimedFrame, stored_frames
 from vslam.datasets.image_files import same_images
 from vslam.datasets.image_folders import open_images
 from vslam.datasets.names import pair_names
-from vslam.errors import InputError
+from vslam.errors import InputError, UnreadableImageError
+from vslam.run.options import RunOptions
+from vslam.run.pair import PairCheck, how_to_swap
 
 RNG = np.random.default_rng(0)
 N = 30
@@ -203,3 +208,100 @@ def test_depth_as_right_image(tmp_path):
         write(tmp_path / "b", f"{k}.png", scene(k, 0).astype(np.uint16) * 100)
     with pytest.raises(InputError, match="are not a stereo pair; give depth images with --depth"):
         open_images(tmp_path / "a", tmp_path / "b", fps=10.0)
+
+
+def source_of(corridor, change) -> Source:
+    """Make a source of the corridor whose pairs have been changed."""
+    pairs = change(list(zip(corridor.left, corridor.right, strict=True)))
+    frames = stored_frames(0.1 * np.arange(len(pairs)), lambda k, image_map: pairs[k])
+    return Source(dataset="images", name="corridor", camera=corridor.camera, stored=frames)
+
+
+def checked(source: Source) -> list[str]:
+    check = PairCheck(source.camera, "images", RunOptions(data="a", right=Path("b")))
+    frames = list(check.watch(iter(source.stored)))
+    assert frames == list(source.stored)
+    return check.warnings()
+
+
+def late(pairs, n):
+    return [(pairs[k][0], pairs[k - n][1]) for k in range(max(n, 0), len(pairs) + min(n, 0))]
+
+
+def sloping(image):
+    height, width = image.shape
+    M = cv2.getRotationMatrix2D((width / 2, height / 2), 1.5, 1.0)
+    return cv2.warpAffine(image, M, (width, height), borderMode=cv2.BORDER_REFLECT)
+
+
+@pytest.mark.parametrize(
+    ("change", "warning"),
+    [
+        (lambda pairs: pairs, None),
+        (lambda pairs: late(pairs, 1), "seem to be 1 frame late"),
+        (lambda pairs: late(pairs, -3), "seem to be 3 frames early"),
+        (lambda pairs: late(pairs, 3), "seem to be 3 frames late"),
+        (lambda pairs: [(a, np.roll(b, 3, axis=0)) for a, b in pairs], "not rectified"),
+        (lambda pairs: [(a, sloping(b)) for a, b in pairs], "not rectified"),
+        (lambda pairs: [(a, np.roll(b, 9, axis=1)) for a, b in pairs], "turned outwards"),
+        (
+            lambda pairs: [(a, np.random.default_rng(0).permuted(b, axis=1)) for a, b in pairs],
+            "no points in common",
+        ),
+        # Images that prove nothing
+        (lambda pairs: pairs[:1] * 20, None),
+        (lambda pairs: [(a, 0 * b) for a, b in pairs], None),
+        (lambda pairs: late(pairs, 1)[:3], None),
+        (lambda pairs: late(pairs[:6], 1) + pairs[5:], None),  # a fault that is found only once
+    ],
+)
+def test_faults_of_a_pair(corridor, change, warning):
+    said = checked(source_of(corridor, change))
+    assert len(said) == (warning is not None)
+    if warning is not None:
+        assert warning in said[0]
+        assert said[0].endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda pairs: [(a, a) for a, _ in pairs], "images are the same"),
+        (lambda pairs: [(b, a) for a, b in pairs], r"are swapped.*; swap the folders of"),
+        (lambda pairs: [(b, a) for a, b in pairs[:1] * 20], "are swapped"),
+    ],
+)
+def test_what_cannot_be_a_pair_is_refused(corridor, change, message):
+    with pytest.raises(InputError, match=message):
+        run_source(source_of(corridor, change))
+
+
+def test_a_late_side_is_reported_but_not_that_of_a_perturbation(corridor):
+    outcome = run_source(source_of(corridor, lambda pairs: late(pairs, 1)))
+    assert any("seem to be 1 frame late" in said for said in outcome.warnings)
+    sound = source_of(corridor, lambda pairs: pairs)
+    outcome = run_source(sound, perturb="desync:2")
+    assert not any("seem to be" in said for said in outcome.warnings)
+
+
+def test_frames_that_cannot_be_read_are_passed_on(corridor):
+    sound = source_of(corridor, lambda pairs: pairs).stored
+
+    def broken(image_map):
+        raise UnreadableImageError(Path("0.png"), "cannot be decoded.")
+
+    frames = [TimedFrame(-0.1, broken), *sound]
+    check = PairCheck(corridor.camera, "images", RunOptions())
+    assert list(check.watch(iter(frames))) == frames
+    check = PairCheck(corridor.camera, "images", RunOptions())
+    assert list(check.watch(chain(sound[:1]))) == list(sound[:1])
+
+
+@pytest.mark.parametrize(("dataset", "options", "advice"), [
+    ("images", {"data": "a", "right": "b"}, "swap them: --data b --right a"),
+    ("images", {"data": "a"}, "swap the folders of the left and the right images"),
+    ("bag", {"topics": "/a,/b"}, "swap them: --topics /b,/a"),
+    ("bag", {}, "give both topics with --topics, that of the left images first"),
+])  # fmt: skip
+def test_how_to_swap_names_only_options_that_help(dataset, options, advice):
+    assert how_to_swap(dataset, RunOptions(**options)) == advice

@@ -24,20 +24,14 @@ from vslam.datasets.times import (
 )
 from vslam.doctor.findings import Finding, judge
 from vslam.doctor.focal_length import FocalFit
-from vslam.doctor.matching import Matches, count_views
 from vslam.errors import counted
+from vslam.run.matching import Matches, count_views
+from vslam.run.pair import ROWS_PX, find_lag, judge_sides, row_error
 
 Times = NDArray[np.float64]
 Depth = NDArray[Any]  # any type of number; 0 or NaN means that the depth is missing
 
-# A run searches for stereo matches within 2 rows. The error of KITTI's rectification is 0.3 to 0.5
-# px.
-ROWS_PX = 0.8
-IN_FRONT = 0.9  # least share of positive disparities; those of distant points scatter around 0
 EXPOSURE = 0.25  # largest relative difference in brightness, because matching compares grey values
-# A lag in frames is reported only if it reduces the row error by at least this many pixels, and to
-# at most this fraction.
-LAG_GAIN_PX, LAG_FACTOR = 0.25, 0.6
 FEATURES = 0.5  # least share of the requested number of features
 # Contrast of pixels with their neighbours, relative to the contrast with a wider neighbourhood. It
 # is 0.43 for KITTI, 0.25 for TUM and 0.27 for EuRoC. After a Gaussian blur of 1.5 px, it is at most
@@ -66,13 +60,18 @@ FOCAL = 0.05
 FOCAL_SIGMA = 0.01  # largest sigma of a fit that is used; on straight roads, it is 0.05 or more
 TURNED = 2.0  # least rotation in degrees; a straight road has up to 1.6 within four frames
 NEAREST_DEPTH_M, FARTHEST_DEPTH_M = 0.05, 100.0  # plausible median depths of a sensor
+_FIX_SIDES = {
+    "same": "both images are the same: give the right camera's images",
+    "swapped": "left and right are swapped, or the baseline has the wrong sign: swap the cameras",
+    "outwards": "many disparities are negative: the cameras are turned outwards; calibrate again",
+}
 _BORDER = 2  # px; if a peak is this near the end of the search range, the true peak may lie outside
 _REACH = 16, 48  # px, vertical and horizontal search range; the sensors are side by side
 
 
 def check_rectification(matches: Matches) -> Finding:
     """Check that both points of a stereo match lie in the same row, as in a rectified pair."""
-    rows = float(np.median(np.abs(matches.left[:, 1] - matches.right[:, 1])))
+    rows = row_error(matches)
     return judge(
         "rectification",
         rows > ROWS_PX,
@@ -84,21 +83,10 @@ def check_rectification(matches: Matches) -> Finding:
 def check_sides(matches: Matches) -> Finding:
     """Check that left and right images are not swapped, which would make disparities negative."""
     disparity = matches.left[:, 0] - matches.right[:, 0]
-    in_front = float(np.mean(disparity > -ROWS_PX))
-    middle = float(np.median(disparity))
-    measured = f"median disparity {middle:.1f} px, {100 * in_front:.0f} % not negative"
-    if float(np.median(np.abs(disparity))) < 0.1:
-        return Finding(
-            "sides", "fault", measured, "both images are the same: give the right camera's images"
-        )
-    return judge(
-        "sides",
-        in_front < IN_FRONT,
-        measured,
-        "left and right are swapped, or the baseline has the wrong sign: swap the cameras"
-        if middle < 0
-        else "many disparities are negative: the cameras are turned outwards; calibrate again",
-    )
+    in_front = 100.0 * float(np.mean(disparity > -ROWS_PX))
+    measured = f"median disparity {np.median(disparity):.1f} px, {in_front:.0f} % not negative"
+    sides = judge_sides(matches)
+    return judge("sides", sides != "good", measured, _FIX_SIDES.get(sides, ""))
 
 
 def check_scale(camera: Camera, matches: Matches | None) -> Finding:
@@ -199,21 +187,18 @@ def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, in
         return Finding("synchronisation", "unknown", "too few frames with matches"), 0
     errors = ", ".join(f"{lag:+d}: {error:.2f} px" for lag, error in sorted(rows_of_lag.items()))
     measured = f"vertical error by lag in frames: {errors}"
-    spread = max(rows_of_lag.values()) - min(rows_of_lag.values())
-    if spread < LAG_GAIN_PX:
+    best = find_lag(rows_of_lag)
+    if best is None:
         return Finding("synchronisation", "unknown", f"{measured}; the camera hardly moves"), 0
-    best = min(rows_of_lag, key=lambda lag: (rows_of_lag[lag], abs(lag)))
-    now, then = rows_of_lag[0], rows_of_lag[best]
-    wrong = now - then > LAG_GAIN_PX and then < LAG_FACTOR * now
     finding = judge(
         "synchronisation",
-        wrong,
+        best != 0,
         measured,
         f"the right image is {counted(abs(best), 'frame')} "
         f"{'late' if best > 0 else 'early'}: trigger both cameras together, or shift the "
         "timestamps of one camera",
     )
-    return finding, best if wrong else 0
+    return finding, best
 
 
 def check_features(counts: Sequence[int], requested: int) -> Finding:

@@ -19,13 +19,14 @@ from vslam.datasets.frames import Source
 from vslam.doctor import checks
 from vslam.doctor.findings import Finding, judge, sections
 from vslam.doctor.focal_length import Moved, fit_focal_length
-from vslam.doctor.matching import Matches, joined, match_images
 from vslam.errors import UnreadableImageError, counted, write_file
 from vslam.frontend.extraction import find_corners
 from vslam.frontend.masks import Mask
 from vslam.frontend.tracking import TrackingContext
 from vslam.report.page import Figure, Page, Section
 from vslam.report.render import html
+from vslam.run.matching import Matches, joined, match_images
+from vslam.run.pair import ROWS_PX, row_error
 
 _FRAMES = 8  # number of examined frames, which are spread over the sequence
 _LAGS = range(-2, 3)  # delays of the right image that are tried, in frames
@@ -152,7 +153,7 @@ class _Pair:
     @property
     def rows(self) -> float:
         """Median vertical error of the stereo matches (px)."""
-        return float(np.median(np.abs(self.matches.left[:, 1] - self.matches.right[:, 1])))
+        return row_error(self.matches)
 
 
 def _pairs_with_lag(sequence: Source, lefts: dict[int, Image], lag: int) -> list[_Pair]:
@@ -245,7 +246,7 @@ def _disparities(
     of_keypoint = {
         tuple(a): a[0] - b[0]
         for a, b in zip(pair.left.tolist(), pair.right.tolist(), strict=True)
-        if abs(a[1] - b[1]) < 2.0 * checks.ROWS_PX
+        if abs(a[1] - b[1]) < 2.0 * ROWS_PX
     }
     return np.array([of_keypoint.get(tuple(a), 0.0) for a in xy.tolist()], np.float64)
 
@@ -278,7 +279,7 @@ def _stereo_picture(pair: _Pair) -> Picture:
     drawn = cv2.cvtColor(canvas, cv2.COLOR_GRAY2BGR)
     off = np.abs(matches.left[:, 1] - matches.right[:, 1])
     for k in np.linspace(0, len(matches) - 1, min(_DRAWN, len(matches))).astype(int):
-        color = _GREEN if off[k] <= checks.ROWS_PX else _RED
+        color = _GREEN if off[k] <= ROWS_PX else _RED
         a = np.rint(matches.left[k]).astype(int).tolist()
         b = np.rint(matches.right[k] + (begin, 0)).astype(int).tolist()
         cv2.circle(drawn, a, 4, color, 1, cv2.LINE_AA)
@@ -286,7 +287,7 @@ def _stereo_picture(pair: _Pair) -> Picture:
         cv2.line(drawn, (width, a[1]), (begin - 1, b[1]), color, 1, cv2.LINE_AA)
     other = f" with the right image of frame {pair.frame + pair.lag}" if pair.lag else ""
     caption = (
-        f"Frame {pair.frame}{other}: matches whose rows agree to {checks.ROWS_PX} px in green, "
+        f"Frame {pair.frame}{other}: matches whose rows agree to {ROWS_PX} px in green, "
         "others in red. The lines between the images of a rectified pair are horizontal."
     )
     return Picture(caption, np.asarray(drawn, np.uint8))

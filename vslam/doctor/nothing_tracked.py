@@ -1,19 +1,9 @@
-"""Explains why a run tracked no frame, by examining a few frames of the run."""
+"""Explains why a run tracked no frame."""
 
 from __future__ import annotations
 
-from itertools import islice
-
-import numpy as np
-
-from vslam.datasets.frames import Source
-from vslam.doctor.checks import check_sides
-from vslam.doctor.matching import joined, match_images
-from vslam.errors import InputError, counted
-from vslam.run.options import RunOptions
+from vslam.errors import counted
 from vslam.run.outcome import RunOutcome
-
-_FRAMES = 3  # they determine the sign of the disparity: each has hundreds of matches
 
 
 def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:
@@ -29,14 +19,6 @@ def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:
         return f"{problem}: no image could be read ({outcome.skipped[0].rstrip('.')})"
     if options.localize:
         return f"{problem}: no frame was recognised in the map {options.map_file}"
-    if outcome.sequence.camera.sensor == "stereo" and not outcome.sequence.live:
-        disparity = _negative_disparity(outcome.sequence)
-        if disparity is not None:
-            fix = how_to_swap(outcome.sequence.dataset, options)
-            return (
-                f"{problem}: disparities are negative (median {disparity:.1f} px), as if left and "
-                f"right were swapped; {fix}"
-            )
     if options.perturb != "none":
         return f"{problem} under --perturb {options.perturb}; a weaker perturbation may work"
     if outcome.sequence.camera.monocular:
@@ -45,40 +27,3 @@ def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:
             "doctor checks images, calibration and times"
         )
     return f"{problem}: vslam doctor checks images, calibration and times"
-
-
-def _negative_disparity(source: Source) -> float | None:
-    """Return the median disparity (px) of a few frames if left and right seem to be swapped."""
-    found = []
-    try:
-        for frame in islice(source.frames(), _FRAMES):
-            left, right = frame.read(map)
-            found.append(match_images(left, np.asarray(right, np.uint8)))
-    except InputError:  # a damaged image; the frames before it are enough
-        pass
-    if not any(map(len, found)):
-        return None
-    matches = joined(found)
-    middle = float(np.median(matches.left[:, 0] - matches.right[:, 0]))
-    swapped = middle < 0 and check_sides(matches).verdict == "fault"
-    return middle if swapped else None
-
-
-def how_to_swap(dataset: str, options: RunOptions) -> str:
-    """Tell the user how to swap the left and the right images."""
-    if dataset == "images" and options.right is not None:
-        return f"swap them: --data {options.right} --right {options.data}"
-    if dataset == "images":
-        return "swap the folders of the left and the right images"
-    if dataset == "bag" and options.topics:
-        return f"swap them: --topics {','.join(reversed(options.topics.split(',')))}"
-    if dataset == "bag":
-        return "give both topics with --topics, that of the left images first"
-    if dataset == "video":
-        return "swap the halves of the images: the left camera's half must be on the left"
-    folders = {
-        "kitti": "image_0 and image_1",
-        "kitti_raw": "image_00 and image_01",
-        "euroc": "cam0 and cam1",
-    }
-    return f"swap {folders.get(dataset, 'the images of both cameras')}"

@@ -32,6 +32,7 @@ from vslam.plugins import reason
 from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome, causal_trajectory, ground_truth_of
+from vslam.run.pair import PairCheck
 from vslam.run.preparation import Played, PreparedFrame, at_their_times
 from vslam.run.progress import Progress, TrackLog, in_frames
 from vslam.run.recorder import Recorder
@@ -86,13 +87,15 @@ def run_sequence(
     cv2.setNumThreads(1)  # the thread pool already uses all cores
     slam = slam or begin(sequence.camera, settings, None if resume is None else resume.map)
     perturbation = perturbation.bound_to(sequence)
-    others = [] if resume is not None else _compared(sequence.camera, settings)
+    pair = PairCheck(sequence.camera, sequence.dataset, settings)
+    others = [] if resume is not None else _compared(sequence.camera, settings, pair)
     recorder.begin(sequence.camera, ground_truth_of(sequence))
-    main = _Run(slam, settings, Progress() if resume is None else resume.progress)
+    main = _Run(slam, settings, Progress() if resume is None else resume.progress, pair)
     n_recorded = 0  # loops passed to the recorder so far
     end_reasons: list[str] = []  # why the run ended early; the first reason counts
     with _stop_on_interrupt() as interrupted:
-        frames = perturbed(_until_broken(sequence.frames(), end_reasons), perturbation)
+        frames = pair.watch(_until_broken(sequence.frames(), end_reasons))
+        frames = perturbed(frames, perturbation)
         frames = _following(frames, main.before.tracks.timestamps)
         try:
             for played in at_their_times(
@@ -147,11 +150,11 @@ def run_sequence(
     return replace(_outcome(sequence, main, seconds, end_reason), compared=compared)
 
 
-def _compared(camera: Camera, settings: RunOptions) -> list[_Run]:
+def _compared(camera: Camera, settings: RunOptions, pair: PairCheck) -> list[_Run]:
     """Begin a run for each loop detector in ``settings.compare``, with its shipped weights."""
     common: dict[str, object] = {"weights": None, "compare": ()}
     each = [settings.model_copy(update={**common, "detector": name}) for name in settings.compare]
-    return [_Run(begin(camera, one), one, Progress()) for one in each]
+    return [_Run(begin(camera, one), one, Progress(), pair) for one in each]
 
 
 class _Run:
@@ -160,11 +163,12 @@ class _Run:
     For a resumed run, the results include the part before the interruption.
 
     Attributes:
+        pair: the check of the first stereo pairs, which all detectors share.
         step_s: wall seconds that this detector alone took (``RunOutcome.step_s``).
     """
 
-    def __init__(self, slam: Slam, settings: RunOptions, before: Progress) -> None:
-        self.slam, self.settings, self.before = slam, settings, before
+    def __init__(self, slam: Slam, settings: RunOptions, before: Progress, pair: PairCheck) -> None:
+        self.slam, self.settings, self.before, self.pair = slam, settings, before, pair
         self.tracks = before.tracks.results()
         if self.tracks:
             slam.resume_odometry(self.tracks[-1])
@@ -371,6 +375,7 @@ def _source_warnings(source: Source, run: _Run) -> list[str]:
         *(source.timing.warnings() if source.timing is not None else []),
         *jitter_warnings(times, source.name),
         *calibration_warnings(source.camera, run.settings.calib, source.name),
+        *run.pair.warnings(),
     ]
 
 

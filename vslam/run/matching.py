@@ -42,31 +42,59 @@ class Matches:
         return len(self.left)
 
 
+@dataclass(frozen=True)
+class Described:
+    """An ``(H, W)`` uint8 image with its ORB features.
+
+    Attributes:
+        xy: ``(N, 2)`` float32 positions in pixels.
+        descriptors: ``(N, 32)`` uint8.
+    """
+
+    image: Image
+    xy: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+
+
+def describe(image: Image, n_features: int = _FEATURES) -> Described:
+    """Extract at most ``n_features`` ORB features."""
+    keypoints, descriptors = cv2.ORB.create(n_features).detectAndCompute(image, None)
+    if descriptors is None:
+        return Described(image, np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
+    xy = np.array([keypoint.pt for keypoint in keypoints], np.float32)
+    return Described(image, xy, np.asarray(descriptors, np.uint8))
+
+
 def match_images(left: Image, right: Image) -> Matches:
+    """Match two images as `match_described` does, with 2000 features each.
+
+    The contrast of faint images is raised first, as in a run.
+    """
+    images = describe(left), describe(right)
+    if is_faint((left, right), (len(images[0].xy), len(images[1].xy)), _CONFIG):
+        clear = [with_contrast(image, _CONFIG.weak_images) for image in (left, right)]
+        images = describe(clear[0]), describe(clear[1])
+    return match_described(*images)
+
+
+def match_described(left: Described, right: Described) -> Matches:
     """Find ORB matches that satisfy one epipolar geometry, and refine them using optical flow.
 
-    The contrast of faint images is raised first, as in a run. If fewer than twelve matches are
-    found, the result contains no matches.
+    If fewer than twelve matches are found, the result contains no matches.
     """
-    orb = cv2.ORB.create(_FEATURES)
-    kp_left, d_left = orb.detectAndCompute(left, None)
-    kp_right, d_right = orb.detectAndCompute(right, None)
-    if is_faint((left, right), (len(kp_left), len(kp_right)), _CONFIG):
-        left, right = (with_contrast(image, _CONFIG.weak_images) for image in (left, right))
-        kp_left, d_left = orb.detectAndCompute(left, None)
-        kp_right, d_right = orb.detectAndCompute(right, None)
     none = Matches(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
-    if len(kp_left) < _MIN_MATCHES or len(kp_right) < _MIN_MATCHES:
+    if len(left.xy) < _MIN_MATCHES or len(right.xy) < _MIN_MATCHES:
         return none
-    found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(d_left, d_right)
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+    found = matcher.match(left.descriptors, right.descriptors)
     found = [match for match in found if match.distance <= _MAX_DISTANCE]
     if len(found) < _MIN_MATCHES:
         return none
-    a = np.array([kp_left[match.queryIdx].pt for match in found], np.float32)
-    b = np.array([kp_right[match.trainIdx].pt for match in found], np.float32)
+    a = left.xy[[match.queryIdx for match in found]]
+    b = right.xy[[match.trainIdx for match in found]]
     refined, tracked, _ = cv2.calcOpticalFlowPyrLK(
-        left, _with_contrast_of(right, left), a, b.copy(), winSize=_WINDOW, maxLevel=0,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        left.image, _with_contrast_of(right.image, left.image), a, b.copy(),
+        winSize=_WINDOW, maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     near = (tracked.ravel() == 1) & (np.linalg.norm(refined - b, axis=1) < _REFINED_PX)
     a, b = a[near], refined[near]

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
-from test_report import make_outcome
+from test_report import CAMERA, make_outcome
 
+from vslam.camera import Camera
 from vslam.errors import InputError, ResultsError
 from vslam.map import Map
 from vslam.maps.storage import load_map
@@ -53,6 +54,7 @@ def test_unwritable_place(tmp_path):
 class _Sequence:
     timestamps: np.ndarray = field(default_factory=lambda: 0.1 * np.arange(5))
     ground_truth: np.ndarray | None = None
+    camera: Camera = CAMERA
 
 
 def test_ground_truth_of_just_the_frames_done(tmp_path):

@@ -72,6 +72,10 @@ def test_an_image_that_is_cut_off_is_damaged(tmp_path, suffix):
     assert f"because {kind.name[2:]} is cut off or damaged; download it again" in refusal(
         read_grey, path
     )
+    path.write_bytes(b"Not found\n")
+    assert 'because it is a text ("Not found"); replace it' in refusal(read_grey, path)
+    path.write_bytes(b"")
+    assert "the file is missing or empty; download it again" in refusal(read_grey, path)
     path.write_bytes(b"\x05garbage")
     assert "damaged or not an image; download it again" in refusal(read_grey, path)
 
@@ -99,8 +103,9 @@ def test_folders_say_what_they_hold(tmp_path):
     for k in range(3):
         (tmp_path / "left" / f"{k}.heic").write_bytes(HEIC)
     (tmp_path / "left" / "notes.txt").write_text("a text")
-    said = "but 3 files like 0.heic (a HEIC photo; convert it to PNG)"
+    said = "but there are 3 files like 0.heic (a HEIC photo; convert it to PNG)"
     assert said in refusal(detect_dataset, str(tmp_path / "left"))
+    assert "like left/0.heic (a HEIC" in refusal(detect_dataset, str(tmp_path))
     assert said in refusal(open_images, tmp_path / "left", sensor="mono")
     (tmp_path / "right").mkdir()
     (tmp_path / "right" / "0.png").write_bytes(encoded(".png", np.zeros((4, 5), np.uint8)))

@@ -265,7 +265,7 @@ def test_zero_byte_image_anywhere(root):
 
 
 def test_first_image_unreadable(root):
-    (root / "sequences/00/image_0/000000.png").write_bytes(b"not an image")
+    (root / "sequences/00/image_0/000000.png").write_bytes(b"\0not an image")
     refused(root, "image_0/000000.png", "cannot be decoded", "download")
 
 

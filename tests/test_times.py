@@ -260,5 +260,5 @@ def test_a_list_of_dates_in_which_one_line_is_no_date(tmp_path):
     path.write_text("2011-09-26 13:02:25.25\n\n2011-09-26 13:02:2x\n")
     with pytest.raises(InputError, match="line 3 is not a date and time, unlike the lines before"):
         read_times(path)
-    path.write_bytes("# times\r\n2011-09-26 13:02:25.25\r\n".encode("utf-16"))
+    path.write_bytes("time\r\n2011/09/26 13:02:25.25\r\n".encode("utf-16"))
     assert read_times(path).tolist() == [1317042145.25]

@@ -95,14 +95,19 @@ _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
          (codecs.BOM_UTF16_BE, "utf-16"))  # fmt: skip
 
 
-def identify(path: Path) -> FileKind | None:
-    """Tell the kind of a file from its first bytes; None for plain text and unknown contents."""
+def _head(path: Path) -> bytes:
+    """Read the first bytes of a file; none if it cannot be read."""
     try:
         with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
+            return file.read(_HEAD_BYTES)
     except (OSError, ValueError):  # ValueError: the path has a zero byte
-        return None
-    if path.suffix.lower() in _RAW_SUFFIXES:
+        return b""
+
+
+def identify(path: Path) -> FileKind | None:
+    """Tell the kind of a file from its first bytes; None for plain text and unknown contents."""
+    head = _head(path)
+    if head and path.suffix.lower() in _RAW_SUFFIXES:
         return FileKind("a RAW photo", _DEVELOP)
     found = next((kind for at, magic, kind in _KINDS if head.startswith(magic, at)), None)
     if found is not None and head.startswith(b"PK\x03\x04"):
@@ -115,24 +120,34 @@ def identify(path: Path) -> FileKind | None:
 
 def why_not_an_image(path: Path) -> str:
     """Say why a file, which no decoder accepts, is not an image, for an UnreadableImageError."""
-    kind = identify(path)
-    if kind is None:
-        return "cannot be decoded, because it is damaged or not an image; download it again."
-    if kind.fix:
-        return f"{kind.name}, which is not read as an image; {kind.fix}."
-    return f"cannot be decoded, because {kind.name[2:]} is cut off or damaged; download it again."
+    if (kind := identify(path)) is not None:
+        if kind.fix:
+            return f"{kind.name}, which is not read as an image; {kind.fix}."
+        return (
+            f"cannot be decoded, because {kind.name[2:]} is cut off or damaged; download it again."
+        )
+    head = _head(path)
+    if not head:
+        return "the file is missing or empty; download it again."
+    if head.isascii() and not _NO_TEXT.search(begin := head.decode()):
+        begin = " ".join(begin.split())[:40]
+        return f'cannot be decoded, because it is a text ("{begin}"); replace it.'
+    return "cannot be decoded, because it is damaged or not an image; download it again."
 
 
 def what_is_in(folder: Path) -> str:
-    """Describe the files of a folder without readable images, for a message in which the folder is
-    the subject: ``, but 12 files like a.heic (a HEIC photo; convert it to PNG)``. The text is empty
-    if there is nothing to say."""
-    files = sorted(path for path in folder.glob("*") if path.is_file())
+    """Describe the files in a folder without readable images and in its subfolders.
+
+    Returns:
+        Text for a message, such as ``, but there are 12 files like a.heic (a HEIC photo; convert it
+        to PNG)``. It is empty if there are no such files.
+    """
+    files = sorted(path for level in ("*", "*/*") for path in folder.glob(level) if path.is_file())
     for path in {path.suffix: path for path in files[::-1]}.values():
         if (kind := identify(path)) is not None and kind.fix:
             n = sum(other.suffix == path.suffix for other in files)
-            like = f"{n} files like {path.name}" if n > 1 else path.name
-            return f", but {like} ({kind.name}; {kind.fix})"
+            like = f"are {n} files like" if n > 1 else "is"
+            return f", but there {like} {path.relative_to(folder)} ({kind.name}; {kind.fix})"
     return ""
 
 

@@ -337,6 +337,8 @@ def times_of_list(path: Path, fix: str) -> tuple[list[float], Timing]:
 def read_times(path: Path) -> Times:
     """Read a list with one time per line: a number of seconds, or a date and time (ISO 8601).
 
+    The first line may contain a heading.
+
     Returns:
         ``(N,)`` float64 seconds. Dates become seconds since 1970.
 
@@ -345,7 +347,7 @@ def read_times(path: Path) -> Times:
     """
     times: list[float] = []
     for number, line in enumerate(read_text(path, "a list of times").splitlines(), start=1):
-        if not line.strip() or line.startswith("#"):
+        if not line.strip() or line.startswith("#") or (not times and line.strip()[0].isalpha()):
             continue
         try:
             times.append(seconds_of_date(line.strip()))
@@ -362,12 +364,12 @@ def read_times(path: Path) -> Times:
 def seconds_of_date(text: str) -> float:
     """Convert a date and time of ISO 8601 to seconds since 1970, exact to a microsecond.
 
-    Without a time zone, the time is taken for UTC.
+    Without a time zone, the time is taken for UTC. The date may be written with slashes.
 
     Raises:
         ValueError: the text is not a date with a time.
     """
-    time = datetime.fromisoformat(text)
+    time = datetime.fromisoformat(text.replace("/", "-"))
     if ":" not in text:  # fromisoformat also accepts numbers such as 20110926
         raise ValueError(text)
     return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()

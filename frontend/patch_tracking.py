@@ -17,12 +17,16 @@ from numpy.typing import NDArray
 from vslam.features import PATCH_RADIUS, Features, Pyramid
 from vslam.frontend.alignment import find_patches
 from vslam.frontend.masks import Mask
-from vslam.frontend.pose import optimise_pose
+from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
+from vslam.frontend.standstill import Standstill, is_small, still_stands
 from vslam.frontend.tracking import TrackingContext, predict_landmarks
-from vslam.geometry import Matrix, orthonormalised
+from vslam.geometry import Matrix, orthonormalised, transform
 from vslam.map_view import MapView
 
 _MARGIN = PATCH_RADIUS + 2  # least distance of a patch centre from the border of its level, pixels
+
+# In ordinary drives, at least this share of the expected confirmed landmarks agrees with the pose.
+SUPPORT_SHARE = 0.5
 
 
 class PatchTrack(NamedTuple):
@@ -35,7 +39,10 @@ class PatchTrack(NamedTuple):
         features: a feature for each inlier, at the position where the patch was found. It has the
             descriptor of the landmark and no column in the right image.
         n_matches: number of landmarks whose patches were found, including outliers.
+        n_expected: number of confirmed landmarks that should be visible (``LocalMap.confirmed``).
+        n_confirmed: number of confirmed landmarks among the inliers.
         visible: ``(M,)`` ids of the landmarks that the frame should see.
+        stands_still: whether the camera stands still (`track_standing`).
     """
 
     T_cw: Matrix
@@ -43,7 +50,22 @@ class PatchTrack(NamedTuple):
     xyz: Matrix
     features: Features
     n_matches: int
+    n_expected: int
+    n_confirmed: int
     visible: NDArray[np.int32]
+    stands_still: bool = False
+
+    @property
+    def support(self) -> int:
+        """Number of inliers that count when poses are compared. New landmarks may belong to a
+        moving object. They count only if hardly any confirmed landmark is expected."""
+        return self.n_confirmed if self.n_expected >= MIN_TRUSTED else len(self.ids)
+
+    @property
+    def lacks_support(self) -> bool:
+        """Whether so few of the confirmed landmarks agree that the pose may be that of a moving
+        object."""
+        return self.support < SUPPORT_SHARE * self.n_expected
 
     @property
     def share(self) -> float:
@@ -57,8 +79,31 @@ NO_PATCHES_FOUND = PatchTrack(
     np.empty((0, 3)),
     Features.none(),
     0,
+    0,
+    0,
     np.empty(0, np.int32),
 )
+
+
+class _Found(NamedTuple):
+    """The patches that were found in an image.
+
+    Attributes:
+        visible, expected: ``(L,)`` bool, the landmarks with patches that the frame should see, and
+            those whose patches were searched for.
+        seen: ``(N,)`` indices of the landmarks whose patches were found.
+        xy, level: ``(N, 2)`` float32 positions in pixels, and ``(N,)`` uint8 octaves.
+    """
+
+    visible: NDArray[np.bool_]
+    expected: NDArray[np.bool_]
+    seen: NDArray[np.int64]
+    xy: NDArray[np.float32]
+    level: NDArray[np.uint8]
+
+    def select(self, chosen: NDArray[np.bool_]) -> _Found:
+        """Return only the chosen patches; ``chosen`` is ``(N,)`` bool."""
+        return self._replace(seen=self.seen[chosen], xy=self.xy[chosen], level=self.level[chosen])
 
 
 def track_patches(
@@ -76,27 +121,81 @@ def track_patches(
             about two pixels.
         mask: the mask of the image; None uses all pixels.
     """
+    found = _search(pyramid, T_cw, view, context, mask)
+    return _optimised(found, T_cw, view.with_patches.confirmed[found.seen], view, context)
+
+
+def track_standing(
+    pyramid: Pyramid,
+    T_cw: Matrix,
+    standstill: Standstill,
+    view: MapView,
+    context: TrackingContext,
+    mask: Mask | None = None,
+) -> PatchTrack:
+    """Do the same for a camera that stood still in the last frame. The result has no landmarks if
+    the camera has moved off.
+
+    The landmarks that did not move in the image determine the pose.
+
+    Args:
+        T_cw: ``(4, 4)`` pose of the last frame (world to camera).
+    """
+    found = _search(pyramid, T_cw, view, context, mask)
+    known, flow = standstill.flow(view.with_patches.ids[found.seen], found.xy)
+    found, flow = found.select(known), flow[known]
+    xyz, scale = view.with_patches.xyz[found.seen], context.scales[found.level]
+    stayed = is_small(flow, scale)
+    moving = _optimised(found, T_cw, None, view, context)
+    project = context.camera.project
+    moved = project(transform(moving.T_cw, xyz)) - project(transform(standstill.T_cw, xyz))
+    close = transform(T_cw, xyz)[:, 2] < context.close_depth
+    if not still_stands(stayed, is_small(flow - moved[:, :2], scale), close):
+        return NO_PATCHES_FOUND
+    return _optimised(found.select(stayed), T_cw, None, view, context)._replace(stands_still=True)
+
+
+def _search(
+    pyramid: Pyramid, T_cw: Matrix, view: MapView, context: TrackingContext, mask: Mask | None
+) -> _Found:
     known, local = view.patches, view.with_patches
     camera, scales, config = context.camera, context.scales, context.config.alignment
     uvr, radius, octave = predict_landmarks(T_cw, local, 1.0, mask, context)
     margin = _MARGIN * scales[octave]
     size = np.array([camera.width, camera.height])
     inside = (uvr[:, :2] > margin[:, None]) & (uvr[:, :2] < size - 1 - margin[:, None])
-    tried = np.flatnonzero((radius > 0) & inside.all(axis=1))
+    expected = (radius > 0) & inside.all(axis=1)
+    tried = np.flatnonzero(expected)
     level = octave[tried].astype(np.uint8)
     xy = _whole_pixels(uvr[tried, :2], pyramid, level)
     shift = find_patches(
         pyramid, xy, level, T_cw, local.xyz[tried], known, tried, scales, camera.intrinsics, config
     )
     found = np.isfinite(shift[:, 0])
-    seen, level = tried[found], level[found]
-    scale = scales[level]
-    xy = xy[found] + shift[found] * scale[:, None].astype(np.float32)
-    uvr = np.full((len(seen), 3), np.nan)
-    uvr[:, :2] = xy
-    weight = config.certainty * scale**-2.0
-    T_found, inlier = optimise_pose(T_cw, local.xyz[seen], uvr, weight, camera.intrinsics)
-    seen, xy, level = seen[inlier], xy[inlier], level[inlier]
+    xy = xy[found] + shift[found] * scales[level[found]][:, None].astype(np.float32)
+    return _Found(radius > 0, expected, tried[found], xy, level[found])
+
+
+def _optimised(
+    found: _Found,
+    T_cw: Matrix,
+    trusted: NDArray[np.bool_] | None,
+    view: MapView,
+    context: TrackingContext,
+) -> PatchTrack:
+    """Optimise the pose. ``trusted`` is as in `optimise_pose`."""
+    known, local, scale = view.patches, view.with_patches, context.scales[found.level]
+    uvr = np.full((len(found.seen), 3), np.nan)
+    uvr[:, :2] = found.xy
+    T_found, inlier = optimise_pose(
+        T_cw,
+        local.xyz[found.seen],
+        uvr,
+        context.config.alignment.certainty * scale**-2.0,
+        context.camera.intrinsics,
+        trusted=trusted,
+    )
+    seen, xy, level = found.seen[inlier], found.xy[inlier], found.level[inlier]
     features = Features(
         xy=xy,
         octave=level,
@@ -110,7 +209,9 @@ def track_patches(
         local.xyz[seen],
         features,
         len(inlier),
-        local.ids[radius > 0],
+        int(np.count_nonzero(local.confirmed & found.expected)),
+        int(np.count_nonzero(local.confirmed[seen])),
+        local.ids[found.visible],
     )
 
 

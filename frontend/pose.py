@@ -16,6 +16,8 @@ ITERATIONS = 10
 # aligned in the coarsest octave. Larger cells give the same covariances
 # (docs/research/uncertainty.md).
 CELL = 32
+MIN_TRUSTED = 30  # least number of trusted landmarks that determine a pose alone
+TRUSTED_SHARE = 0.7  # a pose with which fewer of them agree may be that of a moving object
 
 
 def optimise_pose(
@@ -25,11 +27,16 @@ def optimise_pose(
     inverse_sigma2: NDArray[np.float64],
     intrinsics: NDArray[np.float64],
     disparity_weight: NDArray[np.float64] | None = None,
+    trusted: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Find the camera pose that minimises the robust reprojection error of fixed landmarks.
 
     Gauss-Newton is run four times. After each run, all observations are classified again by the
     chi-square test, and the next run uses only the inliers. The first two runs use the Huber loss.
+
+    A moving object may have more landmarks than the static scene. If too few trusted landmarks
+    agree with the pose, they alone determine a first pose. Only observations that agree with the
+    first pose are then used, whether they are trusted or not.
 
     Args:
         T_cw: ``(4, 4)`` initial pose (world to camera).
@@ -40,6 +47,8 @@ def optimise_pose(
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         disparity_weight: ``(N,)`` float64, ratio of the standard deviation of u and v to the
             standard deviation of the disparity; None uses the ratio in ``intrinsics``.
+        trusted: ``(N,)`` bool, True for landmarks that are known to be at rest. None if it is
+            unknown for all of them.
 
     Returns:
         The pose ``T_cw``, ``(4, 4)``, and an ``(N,)`` bool mask of the inliers. There are no
@@ -47,7 +56,20 @@ def optimise_pose(
     """
     if disparity_weight is None:
         disparity_weight = np.full(len(points), intrinsics[5])
-    return _optimise(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics)
+    observed = points, uvr, inverse_sigma2, disparity_weight
+    T_found, inlier = _optimise(T_cw, *observed, intrinsics)
+    if trusted is None or (n_trusted := np.count_nonzero(trusted)) < MIN_TRUSTED:
+        return T_found, inlier
+    if np.count_nonzero(inlier[trusted]) >= TRUSTED_SHARE * n_trusted:
+        return T_found, inlier
+    T_trusted, kept = _optimise(T_cw, *(column[trusted] for column in observed), intrinsics)
+    if np.count_nonzero(kept) < max(MIN_TRUSTED, np.count_nonzero(inlier[trusted])):
+        return T_found, inlier
+    agree = np.empty(len(points), np.bool_)
+    _classify(T_trusted, *observed, intrinsics, agree)
+    T_found, kept = _optimise(T_trusted, *(column[agree] for column in observed), intrinsics)
+    agree[agree] = kept
+    return T_found, agree
 
 
 def pose_covariance(
@@ -200,6 +222,11 @@ def _optimise(T_cw, points, uvr, inverse_sigma2, disparity_weight, intrinsics):
                 break
         classify(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier)
     return T, inlier
+
+
+@kernel
+def _classify(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier):
+    classify(T, points, uvr, inverse_sigma2, disparity_weight, intrinsics, inlier)
 
 
 @inner_kernel

@@ -166,7 +166,7 @@ def _locate(
     frame.drop_matches()
     frame.match(feature, place.ids[landmark], place.xyz[landmark])
     frame.set_camera_pose(T_camera_w)
-    inliers = refine(frame, frame.T_cw, context)
+    inliers = refine(frame, frame.T_cw, surroundings, context)
     for window in (config.first_window, context.config.tracking.local_window):
         if inliers < config.min_consensus:
             return 0

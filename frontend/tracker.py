@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -13,8 +13,15 @@ from vslam.features import Extracted, TrackingState, TrackResult, nearest_featur
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
 from vslam.frontend.orb import level_shapes
-from vslam.frontend.patch_tracking import NO_PATCHES_FOUND, PatchTrack, track_patches
+from vslam.frontend.patch_tracking import (
+    NO_PATCHES_FOUND,
+    PatchTrack,
+    track_patches,
+    track_standing,
+)
+from vslam.frontend.pose import MIN_TRUSTED
 from vslam.frontend.pose_alignment import align_pose, coarse_pyramid, coarse_shapes
+from vslam.frontend.standstill import Standstill, has_come_to_rest, is_small
 from vslam.frontend.tracking import (
     TrackingContext,
     track_descriptors,
@@ -56,6 +63,7 @@ class Found:
             relocalised.
         is_doubtful: whether the frame has so few inliers that its matches with landmarks may be
             wrong.
+        stands_still: whether the camera stands still.
     """
 
     state: TrackingState
@@ -64,6 +72,7 @@ class Found:
     visible: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     keyframe: int = -1
     is_doubtful: bool = False
+    stands_still: bool = False
 
     @classmethod
     def at_start(cls, frame: Frame, *, begun: bool) -> Found:
@@ -111,6 +120,12 @@ class Tracker:
         self._config = context.config
         self._n_tracked = 0
         self._resumed_twist: Matrix | None = None
+        self._standstill: Standstill | None = None
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether the camera stood still when it was last tracked."""
+        return self._standstill is not None
 
     @property
     def twist(self) -> Matrix | None:
@@ -153,33 +168,58 @@ class Tracker:
         Args:
             T_cw: ``(4, 4)`` predicted pose (world to camera).
         """
+        view = self._trusting(view)
         last, config = self.last, self._config.tracking
         if frame.pyramid is None or frame.source is None or not len(view.patches.ids):
             return NO_PATCHES_FOUND
+        standstill = self._standstill
+        if last is not None and standstill is not None:
+            track = track_standing(
+                frame.pyramid, last.T_cw, standstill, view, self._context, frame.mask
+            )
+            if track.stands_still:
+                return track
         if last is None or last.twist is None or self.status is not TrackerStatus.TRACKING:
             return NO_PATCHES_FOUND
-        camera, T_aligned = self._context.camera, T_cw
-        if frame.coarse is not None and last.coarse is not None:
-            size = camera.height, camera.width
-            xyz = last.xyz[last.landmark >= 0]
-            if frame.mask is not None:
-                uv = camera.project(transform(T_cw, xyz))[:, :2]
-                coarsest = np.full(len(xyz), self._config.orb.n_levels - 1)
-                xyz = xyz[frame.mask.shows(uv, coarsest)]
-            T_aligned = align_pose(
-                frame.coarse, last.coarse, xyz, last.T_cw, T_cw, camera.intrinsics, size
-            )
+        T_aligned = self._align(frame, last, last.landmark >= 0, T_cw)
         track = track_patches(frame.pyramid, T_aligned, view, self._context, frame.mask)
-        if track.share < config.patch_retry_ratio and T_aligned is not T_cw:
+        doubtful = track.share < config.patch_retry_ratio or track.lacks_support
+        if doubtful and T_aligned is not T_cw:
             # Image alignment may have followed moving objects.
             again = track_patches(frame.pyramid, T_cw, view, self._context, frame.mask)
-            track = max(track, again, key=lambda one: len(one.ids))
+            track = max(track, again, key=lambda one: one.support)
+        confirmed = view.local_landmarks.confirms(last.landmark)
+        if track.lacks_support and np.count_nonzero(confirmed) >= MIN_TRUSTED:
+            T_aligned = self._align(frame, last, confirmed, T_cw)
+            again = track_patches(frame.pyramid, T_aligned, view, self._context, frame.mask)
+            track = max(track, again, key=lambda one: one.support)
         return track
+
+    def _align(self, frame: Frame, last: Frame, chosen: NDArray[np.bool_], T_cw: Matrix) -> Matrix:
+        """Correct a predicted pose by sparse image alignment to the last frame.
+
+        Args:
+            chosen: ``(N,)`` bool, the features of the last frame whose landmarks are used.
+        """
+        if frame.coarse is None or last.coarse is None:
+            return T_cw
+        camera, xyz = self._context.camera, last.xyz[chosen]
+        if frame.mask is not None:
+            uv = camera.project(transform(T_cw, xyz))[:, :2]
+            coarsest = np.full(len(xyz), self._config.orb.n_levels - 1)
+            xyz = xyz[frame.mask.shows(uv, coarsest)]
+        size = camera.height, camera.width
+        return align_pose(frame.coarse, last.coarse, xyz, last.T_cw, T_cw, camera.intrinsics, size)
 
     def judge_patches(self, track: PatchTrack) -> TrackingState:
         """Decide whether a frame can be tracked by patches alone (OK), only if its features do not
         match either (WEAK), or not at all (LOST)."""
         config, n_inliers = self._config.tracking, len(track.ids)
+        if track.stands_still:
+            few = n_inliers < config.min_inliers
+            return TrackingState.WEAK if few else TrackingState.OK
+        if track.n_expected >= MIN_TRUSTED > track.n_confirmed:
+            return TrackingState.LOST
         trusted = config.patch_min_inlier_ratio * track.n_matches
         if n_inliers >= max(config.patch_min_inliers, trusted):
             return TrackingState.OK
@@ -192,7 +232,13 @@ class Tracker:
         """Give the result of tracking by patches to the frame."""
         frame.T_cw, frame.features = track.T_cw, track.features
         frame.landmark, frame.xyz = track.ids, track.xyz
-        return Found(self.judge_patches(track), track.n_matches, len(track.ids), track.visible)
+        return Found(
+            self.judge_patches(track),
+            track.n_matches,
+            len(track.ids),
+            track.visible,
+            stands_still=track.stands_still,
+        )
 
     def match_features(self, frame: Frame, by_patches: Frame, view: MapView) -> bool:
         """Match the landmarks of the local map to the features of a frame that was tracked by
@@ -238,6 +284,7 @@ class Tracker:
         Args:
             T_cw: ``(4, 4)`` predicted pose (world to camera).
         """
+        view = self._trusting(view)
         n_inliers = self._track_previous_frame(frame, T_cw, view)
         if n_inliers < self._config.tracking.min_inliers_frame:
             return Found(TrackingState.LOST, n_matches=n_inliers)
@@ -248,7 +295,7 @@ class Tracker:
         state = judge(n_matches, n_inliers, self._context)
         return Found(state, n_matches, n_inliers, visible, is_doubtful=doubtful)
 
-    def accept(self, frame: Frame, found: Found, frames: FramePoses) -> None:
+    def accept(self, frame: Frame, found: Found, frames: FramePoses, n_keyframes: int) -> None:
         """Accept the pose of a frame that was tracked or relocalised. The next frame is tracked
         from this frame.
 
@@ -259,8 +306,45 @@ class Tracker:
             last = -1 if self.last is None else self.last.index
             step = se3_log(orthonormalised(frame.T_cw @ inverse(frames.pose(last))))
             frame.twist = step / (frame.timestamp - frames.timestamp(last))
+        if not found.stands_still and found.state == TrackingState.OK:
+            self._standstill = self._new_standstill(frame, n_keyframes)
+        elif self._standstill is not None:
+            frame.twist = np.zeros(6)
         self._n_tracked = int(np.count_nonzero(frame.landmark >= 0))
         self.start_from(frame)
+
+    def _trusting(self, view: MapView) -> MapView:
+        """Return the view, in which landmarks that a standing camera saw at rest are confirmed."""
+        standstill = self._standstill
+        if standstill is None:
+            return view
+        if standstill.n_keyframes != view.n_keyframes:
+            self._standstill = None
+            return view
+        local, with_patches = (
+            one._replace(confirmed=one.confirmed | np.isin(one.ids, standstill.ids))
+            for one in (view.local_landmarks, view.with_patches)
+        )
+        return replace(view, local_landmarks=local, with_patches=with_patches)
+
+    def _new_standstill(self, frame: Frame, n_keyframes: int) -> Standstill | None:
+        """Return the standstill that begins with a frame, or None if the camera moves."""
+        last = self.last
+        if last is None or frame.source is None or self.lost_frames:
+            return None
+        before, now = np.flatnonzero(last.landmark >= 0), np.flatnonzero(frame.landmark >= 0)
+        ids, first = np.unique(last.landmark[before], return_index=True)
+        seen = last.refined_features().xy[before[first]]
+        known, flow = Standstill(last.T_cw, ids, seen, n_keyframes).flow(
+            frame.landmark[now], frame.features.xy[now]
+        )
+        now, flow = now[known], flow[known]
+        stayed = is_small(flow, self._context.scales[frame.features.octave[now]])
+        if not has_come_to_rest(stayed):
+            return None
+        now = now[stayed]
+        now = now[np.argsort(frame.landmark[now])]
+        return Standstill(frame.T_cw, frame.landmark[now], frame.features.xy[now], n_keyframes)
 
     def start_from(self, frame: Frame) -> None:
         """Track the next frames from a frame that started a map or a sub-map."""
@@ -280,7 +364,7 @@ class Tracker:
 
     def state(self) -> TrackerState | None:
         """Return the state for a checkpoint, or None before the first frame is tracked."""
-        last = self.last
+        last, still = self.last, self._standstill
         if last is None:
             return None
         return TrackerState(
@@ -293,6 +377,16 @@ class Tracker:
             lost_frames=self.lost_frames,
             n_tracked=self._n_tracked,
             coarse=np.empty(0, np.uint8) if last.coarse is None else last.coarse.pixels,
+            **(
+                {}
+                if still is None
+                else {
+                    "T_cw_still": still.T_cw,
+                    "still_ids": still.ids,
+                    "still_xy": still.xy,
+                    "still_keyframes": still.n_keyframes,
+                }
+            ),
         )
 
     def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
@@ -315,6 +409,11 @@ class Tracker:
         self.lost_frames, self._n_tracked = state.lost_frames, state.n_tracked
         if self.lost_frames:
             self.status = TrackerStatus.LOST
+        self._standstill = None
+        if state.T_cw_still is not None:
+            self._standstill = Standstill(
+                state.T_cw_still, state.still_ids, state.still_xy, state.still_keyframes
+            )
         return last
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
@@ -327,13 +426,17 @@ class Tracker:
         if self.last is None and self.status is not TrackerStatus.RESUMED:
             return 0
         if self.last is not None and self.last.twist is not None:
-            n_matches, n_inliers = track_motion(frame, self.last, T_cw, self._context)
+            n_matches, n_inliers = track_motion(
+                frame, self.last, T_cw, view.local_landmarks, self._context
+            )
             if self._is_trusted(n_matches, n_inliers, self._config.tracking.min_inlier_ratio):
                 return n_inliers
         n_inliers = track_descriptors(frame, view.reference_landmarks, T_cw, self._context)
         if n_inliers >= self._config.tracking.min_inliers_frame or self.twist is None:
             return n_inliers
-        return self._track_predicted(frame, T_cw, view) or self._track_sudden_motion(frame, T_cw)
+        return self._track_predicted(frame, T_cw, view) or self._track_sudden_motion(
+            frame, T_cw, view
+        )
 
     def _track_predicted(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
         """Match all landmarks of the local map near their predicted image positions. Returns the
@@ -353,12 +456,14 @@ class Tracker:
         frame.drop_matches()
         return 0
 
-    def _track_sudden_motion(self, frame: Frame, T_cw: Matrix) -> int:
+    def _track_sudden_motion(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:
         """Track a frame against the last frame if the motion has changed suddenly since then.
         Returns the number of inliers, or 0 if no trustworthy pose was found."""
         if self.last is None or self.status is not TrackerStatus.TRACKING:
             return 0
-        n_matches, n_inliers = track_sudden_motion(frame, self.last, T_cw, self._context)
+        n_matches, n_inliers = track_sudden_motion(
+            frame, self.last, T_cw, view.local_landmarks, self._context
+        )
         if self._is_trusted(n_matches, n_inliers, self._config.tracking.sudden_min_inlier_ratio):
             return n_inliers
         frame.drop_matches()

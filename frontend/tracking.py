@@ -85,7 +85,11 @@ def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
 
 
 def track_motion(
-    frame: Frame, previous: Frame, T_cw: NDArray[np.float64], context: TrackingContext
+    frame: Frame,
+    previous: Frame,
+    T_cw: NDArray[np.float64],
+    local: LocalMap,
+    context: TrackingContext,
 ) -> tuple[int, int]:
     """Track a frame against the points of the previous frame. The points are matched near their
     projections with the predicted pose, and the pose is optimised.
@@ -96,6 +100,7 @@ def track_motion(
     Args:
         frame: receives the pose and the matches.
         T_cw: ``(4, 4)`` predicted pose of the left camera (world to camera).
+        local: tells which landmarks are confirmed.
 
     Returns:
         Number of matches, and number of inliers of the pose optimisation.
@@ -107,14 +112,18 @@ def track_motion(
         matches = _match_previous(frame, previous, T_cw, context, window, 1.0)
         if matches < config.min_inliers_motion:
             continue
-        inliers = refine(frame, T_cw, context)
+        inliers = refine(frame, T_cw, local, context)
         if inliers >= config.min_inliers_motion:
             break
     return matches, inliers
 
 
 def track_sudden_motion(
-    frame: Frame, previous: Frame, T_cw: NDArray[np.float64], context: TrackingContext
+    frame: Frame,
+    previous: Frame,
+    T_cw: NDArray[np.float64],
+    local: LocalMap,
+    context: TrackingContext,
 ) -> tuple[int, int]:
     """Track a frame against the points of the previous frame, although the predicted pose is wrong.
 
@@ -124,6 +133,7 @@ def track_sudden_motion(
     Args:
         frame: receives the pose and the matches.
         T_cw: ``(4, 4)`` predicted pose of the left camera (world to camera).
+        local: tells which landmarks are confirmed.
 
     Returns:
         Number of matches, and number of inliers of the pose optimisation.
@@ -143,7 +153,7 @@ def track_sudden_motion(
         return matches, 0
     frame.drop_matches(matched[~inlier])
     frame.set_camera_pose(T_camera_w)
-    return matches, refine(frame, frame.T_cw, context)
+    return matches, refine(frame, frame.T_cw, local, context)
 
 
 def sampled_pose(
@@ -287,7 +297,7 @@ def track_descriptors(
     if len(feature) < config.min_inliers_lost:
         return 0
     frame.match(feature, reference.ids[landmark], reference.xyz[landmark])
-    return refine(frame, T_cw, context)
+    return refine(frame, T_cw, reference, context)
 
 
 def track_local_map(
@@ -327,7 +337,7 @@ def track_local_map(
     frame.match(feature, local.ids[landmark], local.xyz[landmark])
     matches = int(np.count_nonzero(frame.landmark >= 0))
     shift = align_frame(frame, patches, context.scales, intrinsics, config.alignment)
-    inliers = refine(frame, frame.T_cw, context, shift)
+    inliers = refine(frame, frame.T_cw, local, context, shift)
     return matches, inliers, local.ids[visible | tracked]
 
 
@@ -376,6 +386,7 @@ def _search(
 def refine(
     frame: Frame,
     T_cw: NDArray[np.float64],
+    local: LocalMap,
     context: TrackingContext,
     shift: NDArray[np.float32] | None = None,
 ) -> int:
@@ -384,12 +395,15 @@ def refine(
 
     Args:
         T_cw: ``(4, 4)`` initial pose of the left camera (world to camera).
+        local: tells which landmarks are confirmed.
         shift: the new ``Frame.shift``; None if no match is aligned.
     """
     frame.shift = shift
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
     T_camera_w, inlier = optimise_pose(
-        frame.T_camera_left @ T_cw, *_observed_points(frame, matched, context)
+        frame.T_camera_left @ T_cw,
+        *_observed_points(frame, matched, context),
+        trusted=local.confirms(frame.landmark[matched]),
     )
     frame.set_camera_pose(T_camera_w)
     frame.drop_matches(matched[~inlier])

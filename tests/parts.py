@@ -110,6 +110,7 @@ class Points:
             normal=xyz / distance[:, None],
             distance_range=np.stack([0.1 * distance, distance], axis=1),
             descriptor=self.descriptors[among].view(np.uint64),
+            confirmed=np.ones(len(xyz), np.bool_),
         )
 
     def view(

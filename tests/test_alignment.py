@@ -24,6 +24,7 @@ from vslam.frontend.tracking import TrackingContext, refine
 from vslam.geometry import inverse, se3_exp, transform
 from vslam.map import Map
 from vslam.map_kernels import link_many, unlink
+from vslam.map_view import NO_LANDMARKS
 from vslam.mapping import Mapper
 from vslam.workers import Workers
 
@@ -344,7 +345,7 @@ def test_a_pose_follows_aligned_matches():
     frame.features = replace(frame.features, xy=uvr[:, :2], u_right=uvr[:, 2])
     shift = np.full((n, 2), np.nan, np.float32)
     shift[::2] = 0.5, 0.0
-    assert refine(frame, np.eye(4), CONTEXT, shift) == n
+    assert refine(frame, np.eye(4), NO_LANDMARKS, CONTEXT, shift) == n
     moved = CAMERA.project(transform(frame.T_cw, frame.xyz))[:, 0] - uvr[:, 0]
     certainty = Config().alignment.certainty
     assert moved.mean() == pytest.approx(0.5 * certainty / (certainty + 1), abs=0.02)

@@ -16,7 +16,7 @@ from vslam.frontend.tracking import TrackingContext, refine
 from vslam.geometry import compose, se3_exp, transform
 from vslam.map import Map
 from vslam.map_kernels import link_many
-from vslam.map_view import LocalMap, local_map
+from vslam.map_view import NO_LANDMARKS, LocalMap, local_map
 from vslam.maps.checkpoint import FEATURES
 
 CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.5, 640, 480)
@@ -74,7 +74,7 @@ def test_whichever_camera_saw_a_frame_the_left_one_is_found(side):
     extracted = Extracted(seen_from(T_camera_w), side=side)
     refined = Frame.of(extracted, CAMERA)
     refined.landmark, refined.xyz = np.arange(N, dtype=np.int32), points()
-    assert refine(refined, se3_exp(np.full(6, 0.02)) @ T_CW, CONTEXT) == N
+    assert refine(refined, se3_exp(np.full(6, 0.02)) @ T_CW, NO_LANDMARKS, CONTEXT) == N
     found = Frame.of(extracted, CAMERA)
     assert relocalise(found, place(), place(), CONTEXT, seed=0) > 0.8 * N
     for frame in (refined, found):

@@ -15,7 +15,7 @@ from vslam.frontend.frame import Frame
 from vslam.frontend.tracker import Found, Tracker, TrackerStatus, judge
 from vslam.frontend.tracking import TrackingContext, track_motion
 from vslam.geometry import se3_exp
-from vslam.map_view import MapView
+from vslam.map_view import NO_LANDMARKS, MapView
 
 CONTEXT = TrackingContext.create(CAMERA, Config())
 POINTS = Points.create()
@@ -70,7 +70,7 @@ class Drive:
         if k == 0:
             self.tracker.start_from(frame)
         else:
-            self.tracker.accept(frame, found, self.frames)
+            self.tracker.accept(frame, found, self.frames, 1)
         self.frames.append(frame.timestamp, frame.T_cw, tracked=True)
         return frame
 
@@ -249,7 +249,10 @@ def test_a_frame_after_a_sudden_turn_is_tracked_from_the_last_frame(pixels, foun
     """Optimisation that starts at the predicted pose fails, because the turn is too large."""
     drive, view = Drive.of_two_frames(), POINTS.view(nearest=NOTHING)
     frame, T_predicted = drive.next_frame(), ahead(0.0, pixels / CAMERA.fx) @ at(2)
-    assert track_motion(drive.next_frame(), drive.tracker.last, T_predicted, CONTEXT)[1] == 0
+    assert (
+        track_motion(drive.next_frame(), drive.tracker.last, T_predicted, NO_LANDMARKS, CONTEXT)[1]
+        == 0
+    )
     found = drive.track(frame, view, T_predicted)
     assert found.is_lost != found_again
     if found_again:
@@ -409,7 +412,7 @@ def test_a_tracker_that_is_restored_goes_on_as_the_one_that_was_not(lost):
     drive.accept(0)
     last = POINTS.tracked_frame(1, 0.1, at(1))
     last.landmark[121:], last.xyz[121:] = -1, np.nan
-    drive.tracker.accept(last, Found(TrackingState.OK), drive.frames)
+    drive.tracker.accept(last, Found(TrackingState.OK), drive.frames, 1)
     drive.frames.append(0.1, last.T_cw, tracked=True)
     for k in range(lost):
         drive.lose(2 + k)

@@ -21,6 +21,8 @@ class LocalMap(NamedTuple):
         ids: ``(N,)`` int32 ids of the landmarks.
         xyz, normal, distance_range, descriptor: ``(N, ...)`` data of the landmarks, as in
             ``Arrays``.
+        confirmed: ``(N,)`` bool, whether at least two keyframes observe the landmark. It was then
+            at rest between these keyframes. A new landmark may belong to a moving object.
     """
 
     ids: NDArray[np.int32]
@@ -28,6 +30,15 @@ class LocalMap(NamedTuple):
     normal: NDArray[np.float64]
     distance_range: NDArray[np.float64]
     descriptor: NDArray[np.uint64]
+    confirmed: NDArray[np.bool_]
+
+    def confirms(self, ids: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Return an ``(M,)`` bool array that tells which of M landmarks are in this local map and
+        confirmed. The landmarks are given by their ids, or -1."""
+        if not len(self.ids):
+            return np.zeros(len(ids), np.bool_)
+        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        return (self.ids[at] == ids) & self.confirmed[at]
 
 
 def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
@@ -44,7 +55,12 @@ def local_map(map_: Map, keyframe: int, limit: int) -> LocalMap:
     a = map_.arrays
     ids = collect_landmarks(a, np.array(chosen, np.int64), map_.n_landmarks)
     return LocalMap(
-        ids, a.xyz[ids], a.normal[ids], a.distance_range[ids], a.landmark_descriptor[ids]
+        ids,
+        a.xyz[ids],
+        a.normal[ids],
+        a.distance_range[ids],
+        a.landmark_descriptor[ids],
+        a.next_row[a.head[ids]] >= 0,
     )
 
 
@@ -54,6 +70,7 @@ NO_LANDMARKS = LocalMap(
     np.empty((0, 3)),
     np.empty((0, 2)),
     np.empty((0, 4), np.uint64),
+    np.empty(0, np.bool_),
 )
 
 

@@ -8,9 +8,15 @@ from vslam.frontend.frame import PlacedFrame
 from vslam.frontend.keyframes import KeyframeEvidence, KeyframePolicy
 from vslam.frontend.tracker import Found, Tracker
 from vslam.frontend.tracking import TrackingContext
+from vslam.geometry import inverse, orthonormalised, se3_log
 from vslam.mapping import Mapper
 from vslam.starter import OneViewStart, Starter
 from vslam.states import PolicyState
+
+# A standing camera is still at its reference keyframe if it has moved by less than this many
+# baselines, and if its rotation moves the image by less than this many pixels.
+STANDS_M, STANDS_PX = 0.1, 3.0
+PATIENCE_S = 5.0  # s before a sub-map begins if a standing camera is lost
 
 
 class Mode:
@@ -81,7 +87,7 @@ class MapBuilding(Mode):
         super().__init__(mapper)
         self.starter = Starter(context)
         self.policy = KeyframePolicy(context)
-        self._monocular = context.camera.monocular
+        self._camera = context.camera
         self._config = context.config.tracking
         self._tracker = tracker
 
@@ -107,13 +113,16 @@ class MapBuilding(Mode):
         config = self._config
         young = self._mapper.n_keyframes <= config.young_keyframes
         patience = 1 if young else config.lost_frames_before_restart
-        if self._monocular:
+        if self._camera.monocular:
             patience = config.monocular_lost_frames
+        last = self._tracker.last if self._tracker.stands_still else None
+        if last is not None and frame.timestamp - last.timestamp < PATIENCE_S:
+            return False  # something may be standing or passing in front of the camera
         return self._tracker.lost_frames >= patience and self.begin(frame)
 
     def map_far_points(self) -> bool:
         last = self._tracker.last
-        if last is None or last.twist is not None or self._monocular:
+        if last is None or last.twist is not None or self._camera.monocular:
             return False
         return self._mapper.map_far_points(last)
 
@@ -128,7 +137,7 @@ class MapBuilding(Mode):
             seconds_since_keyframe=frame.timestamp - self._mapper.last_timestamp,
             mapping_idle=self._mapper.is_merged,
         )
-        if not self._is_keyframe(frame, evidence):
+        if self._stays_at_reference(frame) or not self._is_keyframe(frame, evidence):
             return False
         self._mapper.settle()
         if not self._match_features(frame) or self._use_existing_keyframe(frame):
@@ -136,6 +145,18 @@ class MapBuilding(Mode):
         self._mapper.insert(frame)
         self.policy.reference_renewed()
         return True
+
+    def _stays_at_reference(self, frame: PlacedFrame) -> bool:
+        """Return whether the camera stands still at its reference keyframe. Only a moving object
+        could then show something new."""
+        if not self._tracker.stands_still:
+            return False
+        moved = se3_log(orthonormalised(frame.T_cw @ inverse(self._mapper.view.T_reference)))
+        camera = self._camera
+        return bool(
+            np.linalg.norm(moved[:3]) < STANDS_M * camera.baseline
+            and np.linalg.norm(moved[3:]) * camera.fx < STANDS_PX
+        )
 
     def _is_keyframe(self, frame: PlacedFrame, evidence: KeyframeEvidence) -> bool:
         if frame.source is None:

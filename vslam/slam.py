@@ -356,7 +356,7 @@ class Slam:
             return mapper.append_pose(frame, tracked=False)
         found_again = found.relocalised or tracker.status is not TrackerStatus.TRACKING
         T_moved = T_predicted if found_again else frame.T_cw
-        tracker.accept(frame, found, mapper.frames)
+        tracker.accept(frame, found, mapper.frames, mapper.n_keyframes)
         uncertainty = uncertainty_of(frame, self.rig.offset_sigma, self.context)
         self._follow(frame, T_moved, *uncertainty, found_again=found_again, known_velocity=known)
         return mapper.append_pose(frame, tracked=True, near=found.keyframe)

@@ -32,6 +32,10 @@ class TrackerState:
         n_tracked: number of landmarks that the frame tracked.
         coarse: ``(Q,)`` uint8 pixels of the small images of the frame (``coarse_levels``). The
             array is empty if the frame has no such images.
+        T_cw_still: ``(4, 4)`` pose at which the camera came to rest. None if the camera moves.
+        still_ids, still_xy: ``(S,)`` int32 landmarks and ``(S, 2)`` float32 positions in pixels
+            where they were seen then.
+        still_keyframes: number of keyframes of the map then.
     """
 
     index: int
@@ -43,6 +47,10 @@ class TrackerState:
     lost_frames: int
     n_tracked: int
     coarse: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
+    T_cw_still: Matrix | None = None
+    still_ids: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    still_xy: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 2), np.float32))
+    still_keyframes: int = 0
 
 
 @dataclass(frozen=True)

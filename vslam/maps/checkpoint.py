@@ -24,7 +24,7 @@ from vslam.states import (
 )
 
 # N is the number of features of the last tracked frame. M is the number of keyframes with patches,
-# which have R rows in total.
+# which have R rows in total. S is the number of landmarks that a standing camera saw.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "xy": (np.float32, ("N", 2)),
     "octave": (np.uint8, ("N",)),
@@ -33,6 +33,8 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "u_right": (np.float32, ("N",)),
     "landmark": (np.int32, ("N",)),
     "coarse": (np.uint8, ("Q",)),
+    "still_ids": (np.int32, ("S",)),
+    "still_xy": (np.float32, ("S", 2)),
     "patch_keyframe": (np.int64, ("M",)),
     "patch_pixels": (np.uint8, ("R", PATCH_PIXELS)),
     "patch_shift": (np.float32, ("R", 2)),
@@ -46,7 +48,7 @@ KNOWN_PLACE_ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "place_shift": (np.float32, ("P", 2)),
 }
 FEATURES = ("xy", "octave", "angle", "descriptors", "u_right")
-_TRACKER_FIELDS = ("index", "timestamp", "lost_frames", "n_tracked")
+_TRACKER_FIELDS = ("index", "timestamp", "lost_frames", "n_tracked", "still_keyframes")
 _MOST = 1e12  # metres, pixels or seconds
 _MOST_FRAMES = 2**31
 _MAPPER_FIELDS = ("reference", "last_frame", "last_timestamp")
@@ -61,6 +63,8 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray]:
         **{name: getattr(tracker.features, name) for name in FEATURES},
         "landmark": tracker.landmark,
         "coarse": tracker.coarse,
+        "still_ids": tracker.still_ids,
+        "still_xy": tracker.still_xy,
         "patch_keyframe": np.array([one.keyframe for one in patches], np.int64),
         "patch_pixels": np.concatenate([no_pixels, *(one.pixels for one in patches)]),
         "patch_shift": np.concatenate([no_shift, *(one.shift for one in patches)]),
@@ -87,6 +91,7 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
         | {
             "T_cw": tracker.T_cw.tolist(),
             "twist": None if tracker.twist is None else tracker.twist.tolist(),
+            "T_cw_still": None if tracker.T_cw_still is None else tracker.T_cw_still.tolist(),
         },
         "mapper": {name: getattr(checkpoint.mapper, name) for name in _MAPPER_FIELDS}
         | {"known_place": None if known_place is None else known_place.frame},
@@ -123,6 +128,7 @@ def checked_checkpoint(
         "M": len(arrays["patch_keyframe"]),
         "R": len(arrays["patch_shift"]),
         "P": len(arrays.get("place_landmark", ())),
+        "S": len(arrays["still_ids"]),
     }
     for name, (dtype, shape) in arrays_of(entry).items():
         array = arrays[name]
@@ -134,6 +140,7 @@ def checked_checkpoint(
             raise ValueError(f"checkpoint_{name} is out of range")
     tracker, mapper, policy = (dict(entry[name]) for name in ("tracker", "mapper", "policy"))
     T_cw, twist = tracker.pop("T_cw"), tracker.pop("twist")
+    T_cw_still = tracker.pop("T_cw_still")
     landmark, reference = arrays["landmark"], _count(mapper["reference"])
     # A drive that continues in a stored map has the values -1 and -inf until its first keyframe.
     last_frame, last_timestamp = _count(mapper["last_frame"], -1), mapper["last_timestamp"]
@@ -160,6 +167,10 @@ def checked_checkpoint(
             T_cw=_pose(T_cw),
             twist=None if twist is None else _numbers(twist, 6),
             coarse=arrays["coarse"],
+            T_cw_still=None if T_cw_still is None else _pose(T_cw_still),
+            still_ids=arrays["still_ids"],
+            still_xy=arrays["still_xy"],
+            still_keyframes=_count(tracker.pop("still_keyframes")),
             **tracker,
         ),
         mapper=MapperState(

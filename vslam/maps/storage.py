@@ -28,7 +28,7 @@ from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
 from vslam.untrusted import ARCHIVE_ERRORS, read_json, require_memory
 
-SCHEMA = 8
+SCHEMA = 9
 _FOREIGN = "not a map of vslam; give a map.npz or the folder of a run"
 
 

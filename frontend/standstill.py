@@ -1,0 +1,95 @@
+"""Recognises that the camera stands still, whatever moves in front of it.
+
+When a large vehicle drives past a standing camera, or when a queue of cars moves off, most of the
+image moves. The pose with the most inliers is then the pose relative to the vehicle. However, the
+landmarks of the static scene stay exactly where they were in the image when the camera came to
+rest. Landmarks of a moving object do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.geometry import Matrix
+
+STAY = 0.4  # largest motion of a static landmark, pixels of its octave; patches are found to 0.1 px
+BEGIN_SHARE = 0.8  # the camera has come to rest if this share of the landmarks did not move
+# The camera still stands if this share of the close landmarks did not move, because they move at
+# once when the camera moves off. Either this number of landmarks did not move, or hardly any
+# landmark moved and there are enough to determine the pose.
+KEEP_SHARE, KEEP_LEAST = 0.15, 40
+FEWEST = 15
+# The camera has moved off if one motion explains where at least this share of the landmarks went.
+MOVED_SHARE = 0.9
+
+
+@dataclass(frozen=True)
+class Standstill:
+    """Where N landmarks were in the image when the camera came to rest.
+
+    Attributes:
+        T_cw: ``(4, 4)`` pose of the camera (world to camera).
+        ids: ``(N,)`` int32 ids of the landmarks, sorted.
+        xy: ``(N, 2)`` float32 positions in pixels.
+        n_keyframes: number of keyframes of the map at that time. A new keyframe may change the ids.
+    """
+
+    T_cw: Matrix
+    ids: NDArray[np.int32]
+    xy: NDArray[np.float32]
+    n_keyframes: int
+
+    def flow(
+        self, ids: NDArray[np.int32], xy: NDArray[np.float32]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Compute how far landmarks have moved in the image.
+
+        Args:
+            ids, xy: ``(M,)`` landmarks, and ``(M, 2)`` positions in pixels where they are seen now.
+
+        Returns:
+            ``(M,)`` bool, whether a landmark was seen when the camera came to rest, and ``(M, 2)``
+            pixels. The motion of a landmark that was not seen then has no meaning.
+        """
+        if not len(self.ids):
+            return np.zeros(len(ids), np.bool_), np.zeros((len(ids), 2), np.float32)
+        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        return self.ids[at] == ids, xy - self.xy[at]
+
+
+def is_small(flow: NDArray[np.floating], scale: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether ``(M, 2)`` motions in the image may be errors of measurement. ``scale`` has
+    the ``(M,)`` full-resolution pixels per pixel of the octaves of the landmarks."""
+    small: NDArray[np.bool_] = np.linalg.norm(flow, axis=1) < STAY * scale
+    return small
+
+
+def has_come_to_rest(stayed: NDArray[np.bool_]) -> bool:
+    """Return whether the camera has come to rest. ``stayed`` tells which of the landmarks that two
+    frames tracked did not move in the image."""
+    return bool(np.count_nonzero(stayed) >= max(KEEP_LEAST, BEGIN_SHARE * len(stayed)))
+
+
+def still_stands(
+    stayed: NDArray[np.bool_], follows: NDArray[np.bool_], close: NDArray[np.bool_]
+) -> bool:
+    """Return whether a standing camera still stands, given M landmarks that were seen when it came
+    to rest.
+
+    Args:
+        stayed: ``(M,)`` bool, the landmarks that did not move in the image.
+        follows: ``(M,)`` bool, the landmarks whose motion in the image follows from a motion of the
+            camera that fits all landmarks best.
+        close: ``(M,)`` bool, the landmarks that are so close that they would move in the image.
+    """
+    n_stayed = np.count_nonzero(stayed)
+    if n_stayed < KEEP_LEAST:
+        return bool(n_stayed >= max(FEWEST, BEGIN_SHARE * len(stayed)))
+    if np.count_nonzero(close) >= KEEP_LEAST:
+        stayed, follows = stayed[close], follows[close]
+    if np.mean(stayed) < MOVED_SHARE <= np.mean(follows):
+        return False
+    return bool(np.mean(stayed) >= KEEP_SHARE)

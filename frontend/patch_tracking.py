@@ -19,13 +19,13 @@ from vslam.frontend.alignment import find_patches
 from vslam.frontend.masks import Mask
 from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
 from vslam.frontend.standstill import Standstill, is_small, still_stands
-from vslam.frontend.tracking import TrackingContext, predict_landmarks
+from vslam.frontend.tracking import TrackingContext, predict_landmarks, trusted_landmarks
 from vslam.geometry import Matrix, orthonormalised, transform
 from vslam.map_view import MapView
 
 _MARGIN = PATCH_RADIUS + 2  # least distance of a patch centre from the border of its level, pixels
 
-# In ordinary drives, at least this share of the expected confirmed landmarks agrees with the pose.
+# In ordinary drives, at least this share of the expected trusted landmarks agrees with the pose.
 SUPPORT_SHARE = 0.5
 
 
@@ -39,8 +39,8 @@ class PatchTrack(NamedTuple):
         features: a feature for each inlier, at the position where the patch was found. It has the
             descriptor of the landmark and no column in the right image.
         n_matches: number of landmarks whose patches were found, including outliers.
-        n_expected: number of confirmed landmarks that should be visible (``LocalMap.confirmed``).
-        n_confirmed: number of confirmed landmarks among the inliers.
+        n_expected: number of trusted landmarks that should be visible (``trusted_landmarks``).
+        n_trusted: number of trusted landmarks among the inliers.
         visible: ``(M,)`` ids of the landmarks that the frame should see.
         stands_still: whether the camera stands still (`track_standing`).
     """
@@ -51,19 +51,19 @@ class PatchTrack(NamedTuple):
     features: Features
     n_matches: int
     n_expected: int
-    n_confirmed: int
+    n_trusted: int
     visible: NDArray[np.int32]
     stands_still: bool = False
 
     @property
     def support(self) -> int:
         """Number of inliers that count when poses are compared. New landmarks may belong to a
-        moving object. They count only if hardly any confirmed landmark is expected."""
-        return self.n_confirmed if self.n_expected >= MIN_TRUSTED else len(self.ids)
+        moving object. They count only if hardly any trusted landmark is expected."""
+        return self.n_trusted if self.n_expected >= MIN_TRUSTED else len(self.ids)
 
     @property
     def lacks_support(self) -> bool:
-        """Whether so few of the confirmed landmarks agree that the pose may be that of a moving
+        """Whether so few of the trusted landmarks agree that the pose may be that of a moving
         object."""
         return self.support < SUPPORT_SHARE * self.n_expected
 
@@ -122,7 +122,7 @@ def track_patches(
         mask: the mask of the image; None uses all pixels.
     """
     found = _search(pyramid, T_cw, view, context, mask)
-    return _optimised(found, T_cw, view.with_patches.confirmed[found.seen], view, context)
+    return _optimised(found, T_cw, view, context)
 
 
 def track_standing(
@@ -146,13 +146,15 @@ def track_standing(
     found, flow = found.select(known), flow[known]
     xyz, scale = view.with_patches.xyz[found.seen], context.scales[found.level]
     stayed = is_small(flow, scale)
-    moving = _optimised(found, T_cw, None, view, context)
+    moving = _optimised(found, T_cw, view, context, ask_trusted=False)
     project = context.camera.project
     moved = project(transform(moving.T_cw, xyz)) - project(transform(standstill.T_cw, xyz))
     close = transform(T_cw, xyz)[:, 2] < context.close_depth
     if not still_stands(stayed, is_small(flow - moved[:, :2], scale), close):
         return NO_PATCHES_FOUND
-    return _optimised(found.select(stayed), T_cw, None, view, context)._replace(stands_still=True)
+    return _optimised(found.select(stayed), T_cw, view, context, ask_trusted=False)._replace(
+        stands_still=True
+    )
 
 
 def _search(
@@ -179,11 +181,18 @@ def _search(
 def _optimised(
     found: _Found,
     T_cw: Matrix,
-    trusted: NDArray[np.bool_] | None,
     view: MapView,
     context: TrackingContext,
+    *,
+    ask_trusted: bool = True,
 ) -> PatchTrack:
-    """Optimise the pose. ``trusted`` is as in `optimise_pose`."""
+    """Optimise the pose. ``ask_trusted`` is whether trusted landmarks decide if most landmarks
+    contradict them (`optimise_pose`)."""
+    expected = np.flatnonzero(found.expected)
+    trusted = np.zeros(len(found.expected), np.bool_)
+    trusted[expected] = trusted_landmarks(
+        view.with_patches.confirmed[expected], view.with_patches.xyz[expected], T_cw, context
+    )
     known, local, scale = view.patches, view.with_patches, context.scales[found.level]
     uvr = np.full((len(found.seen), 3), np.nan)
     uvr[:, :2] = found.xy
@@ -193,7 +202,7 @@ def _optimised(
         uvr,
         context.config.alignment.certainty * scale**-2.0,
         context.camera.intrinsics,
-        trusted=trusted,
+        trusted=trusted[found.seen] if ask_trusted else None,
     )
     seen, xy, level = found.seen[inlier], found.xy[inlier], found.level[inlier]
     features = Features(
@@ -209,8 +218,8 @@ def _optimised(
         local.xyz[seen],
         features,
         len(inlier),
-        int(np.count_nonzero(local.confirmed & found.expected)),
-        int(np.count_nonzero(local.confirmed[seen])),
+        int(np.count_nonzero(trusted)),
+        int(np.count_nonzero(trusted[seen])),
         local.ids[found.visible],
     )
 

@@ -22,7 +22,8 @@ BEGIN_SHARE = 0.8  # the camera has come to rest if this share of the landmarks 
 # landmark moved and there are enough to determine the pose.
 KEEP_SHARE, KEEP_LEAST = 0.15, 40
 FEWEST = 15
-# The camera has moved off if one motion explains where at least this share of the landmarks went.
+# The camera has moved off if less than half of the landmarks stayed, and if one motion explains
+# where at least this share of the landmarks went.
 MOVED_SHARE = 0.9
 
 
@@ -90,6 +91,6 @@ def still_stands(
         return bool(n_stayed >= max(FEWEST, BEGIN_SHARE * len(stayed)))
     if np.count_nonzero(close) >= KEEP_LEAST:
         stayed, follows = stayed[close], follows[close]
-    if np.mean(stayed) < MOVED_SHARE <= np.mean(follows):
+    if np.mean(stayed) < 0.5 and np.mean(follows) >= MOVED_SHARE:
         return False
     return bool(np.mean(stayed) >= KEEP_SHARE)

@@ -35,6 +35,11 @@ from vslam.map_view import MapView
 from vslam.odometry import Odometry
 from vslam.states import TrackerState
 
+# The prediction of the motion is wrong by at most this acceleration, m/s^2, in ordinary drives. A
+# pose that implies a larger one needs IMPLAUSIBLE^-1 times as many landmarks that agree with it.
+ACCELERATION = 10.0
+IMPLAUSIBLE = 0.5
+
 
 class TrackerStatus(Enum):
     """The state of the tracker between two frames."""
@@ -181,18 +186,30 @@ class Tracker:
                 return track
         if last is None or last.twist is None or self.status is not TrackerStatus.TRACKING:
             return NO_PATCHES_FOUND
+
+        def track_from(T_start: Matrix) -> PatchTrack:
+            assert frame.pyramid is not None
+            return track_patches(frame.pyramid, T_start, view, self._context, frame.mask)
+
+        def support(track: PatchTrack) -> float:
+            return (1.0 if is_plausible(track) else IMPLAUSIBLE) * track.support
+
+        def is_plausible(track: PatchTrack) -> bool:
+            jump = np.linalg.norm((track.T_cw @ inverse(T_cw))[:3, 3])
+            return bool(jump <= ACCELERATION * (frame.timestamp - last.timestamp) ** 2)
+
         T_aligned = self._align(frame, last, last.landmark >= 0, T_cw)
-        track = track_patches(frame.pyramid, T_aligned, view, self._context, frame.mask)
+        track = track_from(T_aligned)
         doubtful = track.share < config.patch_retry_ratio or track.lacks_support
-        if doubtful and T_aligned is not T_cw:
+        if (doubtful or not is_plausible(track)) and T_aligned is not T_cw:
             # Image alignment may have followed moving objects.
-            again = track_patches(frame.pyramid, T_cw, view, self._context, frame.mask)
-            track = max(track, again, key=lambda one: one.support)
+            track = max(track, track_from(T_cw), key=support)
         confirmed = view.local_landmarks.confirms(last.landmark)
         if track.lacks_support and np.count_nonzero(confirmed) >= MIN_TRUSTED:
             T_aligned = self._align(frame, last, confirmed, T_cw)
-            again = track_patches(frame.pyramid, T_aligned, view, self._context, frame.mask)
-            track = max(track, again, key=lambda one: one.support)
+            track = max(track, track_from(T_aligned), key=support)
+        if track.lacks_support and not is_plausible(track):
+            return NO_PATCHES_FOUND
         return track
 
     def _align(self, frame: Frame, last: Frame, chosen: NDArray[np.bool_], T_cw: Matrix) -> Matrix:
@@ -218,7 +235,7 @@ class Tracker:
         if track.stands_still:
             few = n_inliers < config.min_inliers
             return TrackingState.WEAK if few else TrackingState.OK
-        if track.n_expected >= MIN_TRUSTED > track.n_confirmed:
+        if track.n_expected >= MIN_TRUSTED > track.n_trusted:
             return TrackingState.LOST
         trusted = config.patch_min_inlier_ratio * track.n_matches
         if n_inliers >= max(config.patch_min_inliers, trusted):

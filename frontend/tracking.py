@@ -27,7 +27,7 @@ from vslam.frontend.matching import (
 )
 from vslam.frontend.orb import scale_factors
 from vslam.frontend.pnp import ransac_pose
-from vslam.frontend.pose import offset_effect, optimise_pose, pose_covariance
+from vslam.frontend.pose import MIN_TRUSTED, offset_effect, optimise_pose, pose_covariance
 from vslam.geometry import Matrix, compose, inverse, transform
 from vslam.map_view import LocalMap
 from vslam.odometry import adjoint
@@ -297,7 +297,23 @@ def track_descriptors(
     if len(feature) < config.min_inliers_lost:
         return 0
     frame.match(feature, reference.ids[landmark], reference.xyz[landmark])
-    return refine(frame, T_cw, reference, context)
+    before = frame.snapshot()
+    inliers = refine(frame, T_cw, reference, context)
+    T_camera_w, sampled = sampled_pose(
+        before,
+        feature,
+        reference.xyz[landmark],
+        context,
+        min_inliers=max(inliers + 1, config.min_inliers_lost),
+        seed=frame.index,
+    )
+    if np.count_nonzero(sampled) <= inliers:
+        return inliers
+    # The initial pose was so wrong that the pose of a moving object was nearer.
+    frame.restore(before)
+    frame.drop_matches(feature[~sampled])
+    frame.set_camera_pose(T_camera_w)
+    return refine(frame, frame.T_cw, reference, context)
 
 
 def track_local_map(
@@ -403,11 +419,29 @@ def refine(
     T_camera_w, inlier = optimise_pose(
         frame.T_camera_left @ T_cw,
         *_observed_points(frame, matched, context),
-        trusted=local.confirms(frame.landmark[matched]),
+        trusted=trusted_landmarks(
+            local.confirms(frame.landmark[matched]), frame.xyz[matched], T_cw, context
+        ),
     )
     frame.set_camera_pose(T_camera_w)
     frame.drop_matches(matched[~inlier])
     return int(np.count_nonzero(inlier))
+
+
+def trusted_landmarks(
+    confirmed: NDArray[np.bool_], xyz: Matrix, T_cw: Matrix, context: TrackingContext
+) -> NDArray[np.bool_]:
+    """Choose the landmarks that tell the pose of the camera from that of a moving object: confirmed
+    close landmarks. Far landmarks agree with both. If there are few close ones, all confirmed
+    landmarks are chosen.
+
+    Args:
+        confirmed: ``(N,)`` bool, see ``LocalMap``.
+        xyz: ``(N, 3)`` positions in the world frame.
+        T_cw: ``(4, 4)`` approximate pose (world to camera).
+    """
+    close = confirmed & (transform(T_cw, xyz)[:, 2] < context.close_depth)
+    return close if np.count_nonzero(close) >= MIN_TRUSTED else confirmed
 
 
 def uncertainty_of(

@@ -428,7 +428,7 @@ def test_a_tracker_that_is_restored_goes_on_as_the_one_that_was_not(lost):
         T_cw = tracker.predict(frame.timestamp, drive.frames, view)
         found = tracker.track(frame, T_cw, view, drive.frames)
         assert (found.n_inliers, found.is_doubtful) == (60, True)
-        tracker.accept(frame, found, drive.frames)
+        tracker.accept(frame, found, drive.frames, 1)
         outcomes.append((T_cw.tobytes(), frame.T_cw.tobytes(), tracker.twist.tobytes()))
     assert outcomes[1] == outcomes[0]
 

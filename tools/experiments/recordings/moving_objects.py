@@ -207,7 +207,7 @@ def measure(camera: Camera, left, right, T_true, config=None) -> dict:
         return np.array(
             [
                 np.linalg.norm((inverse(T[0]) @ p)[:3, 3] - (first @ q)[:3, 3])
-                for p, q in zip(T, T_true)
+                for p, q in zip(T, T_true, strict=True)
             ]
         )
 

@@ -16,6 +16,7 @@ ITERATIONS = 10
 # aligned in the coarsest octave. Larger cells give the same covariances
 # (docs/research/uncertainty.md).
 CELL = 32
+ALL = slice(None)
 MIN_TRUSTED = 30  # least number of trusted landmarks that determine a pose alone
 TRUSTED_SHARE = 0.7  # a pose with which fewer of them agree may be that of a moving object
 
@@ -27,6 +28,7 @@ def optimise_pose(
     inverse_sigma2: NDArray[np.float64],
     intrinsics: NDArray[np.float64],
     disparity_weight: NDArray[np.float64] | None = None,
+    *,
     trusted: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Find the camera pose that minimises the robust reprojection error of fixed landmarks.
@@ -56,18 +58,27 @@ def optimise_pose(
     """
     if disparity_weight is None:
         disparity_weight = np.full(len(points), intrinsics[5])
-    observed = points, uvr, inverse_sigma2, disparity_weight
-    T_found, inlier = _optimise(T_cw, *observed, intrinsics)
-    if trusted is None or (n_trusted := np.count_nonzero(trusted)) < MIN_TRUSTED:
+
+    def optimised(
+        T: NDArray[np.float64], used: NDArray[np.bool_] | slice = ALL
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        found: tuple[NDArray[np.float64], NDArray[np.bool_]] = _optimise(
+            T, points[used], uvr[used], inverse_sigma2[used], disparity_weight[used], intrinsics
+        )
+        return found
+
+    T_found, inlier = optimised(T_cw)
+    if trusted is None or (n_trusted := int(np.count_nonzero(trusted))) < MIN_TRUSTED:
         return T_found, inlier
-    if np.count_nonzero(inlier[trusted]) >= TRUSTED_SHARE * n_trusted:
+    n_agree = int(np.count_nonzero(inlier[trusted]))
+    if n_agree >= TRUSTED_SHARE * n_trusted:
         return T_found, inlier
-    T_trusted, kept = _optimise(T_cw, *(column[trusted] for column in observed), intrinsics)
-    if np.count_nonzero(kept) < max(MIN_TRUSTED, np.count_nonzero(inlier[trusted])):
+    T_trusted, kept = optimised(T_cw, trusted)
+    if np.count_nonzero(kept) < max(MIN_TRUSTED, n_agree):
         return T_found, inlier
     agree = np.empty(len(points), np.bool_)
-    _classify(T_trusted, *observed, intrinsics, agree)
-    T_found, kept = _optimise(T_trusted, *(column[agree] for column in observed), intrinsics)
+    _classify(T_trusted, points, uvr, inverse_sigma2, disparity_weight, intrinsics, agree)
+    T_found, kept = optimised(T_trusted, agree)
     agree[agree] = kept
     return T_found, agree
 

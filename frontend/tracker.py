@@ -384,7 +384,7 @@ class Tracker:
         last, still = self.last, self._standstill
         if last is None:
             return None
-        return TrackerState(
+        state = TrackerState(
             index=last.index,
             timestamp=last.timestamp,
             features=last.features,
@@ -394,16 +394,15 @@ class Tracker:
             lost_frames=self.lost_frames,
             n_tracked=self._n_tracked,
             coarse=np.empty(0, np.uint8) if last.coarse is None else last.coarse.pixels,
-            **(
-                {}
-                if still is None
-                else {
-                    "T_cw_still": still.T_cw,
-                    "still_ids": still.ids,
-                    "still_xy": still.xy,
-                    "still_keyframes": still.n_keyframes,
-                }
-            ),
+        )
+        if still is None:
+            return state
+        return replace(
+            state,
+            T_cw_still=still.T_cw,
+            still_ids=still.ids,
+            still_xy=still.xy,
+            still_keyframes=still.n_keyframes,
         )
 
     def restore(self, state: TrackerState, xyz: Matrix) -> Frame:

@@ -18,7 +18,7 @@ from vslam.features import PATCH_RADIUS, Features, Pyramid
 from vslam.frontend.alignment import find_patches
 from vslam.frontend.masks import Mask
 from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
-from vslam.frontend.standstill import Standstill, is_small, still_stands
+from vslam.frontend.standstill import KEEP_LEAST, Standstill, is_small, still_stands
 from vslam.frontend.tracking import TrackingContext, predict_landmarks, trusted_landmarks
 from vslam.geometry import Matrix, orthonormalised, transform
 from vslam.map_view import MapView
@@ -152,9 +152,10 @@ def track_standing(
     close = transform(T_cw, xyz)[:, 2] < context.close_depth
     if not still_stands(stayed, is_small(flow - moved[:, :2], scale), close):
         return NO_PATCHES_FOUND
-    return _optimised(found.select(stayed), T_cw, view, context, ask_trusted=False)._replace(
-        stands_still=True
-    )
+    track = _optimised(found.select(stayed), T_cw, view, context, ask_trusted=False)
+    if np.count_nonzero(stayed) < KEEP_LEAST:  # too few to measure the pose better than before
+        track = track._replace(T_cw=T_cw)
+    return track._replace(stands_still=True)
 
 
 def _search(

@@ -12,6 +12,7 @@ from vslam.camera import Camera
 from vslam.features import Extracted, TrackingState, TrackResult, nearest_features
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
+from vslam.frontend.motion_time import RECENT, motion_seconds
 from vslam.frontend.orb import level_shapes
 from vslam.frontend.patch_tracking import (
     NO_PATCHES_FOUND,
@@ -161,10 +162,12 @@ class Tracker:
         T_last = frames.pose(-1)
         if self.twist is None:
             return T_last
-        elapsed = timestamp - frames.timestamp(-1)
+        elapsed = _motion_seconds(frames, timestamp)
         return orthonormalised(se3_exp(self.twist * elapsed) @ T_last)
 
-    def track_patches(self, frame: Frame, T_cw: Matrix, view: MapView) -> PatchTrack:
+    def track_patches(
+        self, frame: Frame, T_cw: Matrix, view: MapView, frames: FramePoses
+    ) -> PatchTrack:
         """Track a frame using the image patches of landmarks, without extracting features.
 
         The frame is not changed. The result has no landmarks if the frame cannot be tracked in this
@@ -196,8 +199,9 @@ class Tracker:
 
         def is_plausible(track: PatchTrack) -> bool:
             jump = np.linalg.norm((track.T_cw @ inverse(T_cw))[:3, 3])
-            return bool(jump <= ACCELERATION * (frame.timestamp - last.timestamp) ** 2)
+            return bool(jump <= ACCELERATION * seconds**2)
 
+        seconds = _motion_seconds(frames, frame.timestamp)
         T_aligned = self._align(frame, last, last.landmark >= 0, T_cw)
         track = track_from(T_aligned)
         doubtful = track.share < config.patch_retry_ratio or track.lacks_support
@@ -233,15 +237,14 @@ class Tracker:
         match either (WEAK), or not at all (LOST)."""
         config, n_inliers = self._config.tracking, len(track.ids)
         if track.stands_still:
-            few = n_inliers < config.min_inliers
-            return TrackingState.WEAK if few else TrackingState.OK
+            return TrackingState.OK
         if track.n_expected >= MIN_TRUSTED > track.n_trusted:
             return TrackingState.LOST
         trusted = config.patch_min_inlier_ratio * track.n_matches
         if n_inliers >= max(config.patch_min_inliers, trusted):
             return TrackingState.OK
         plausible = config.patch_fallback_ratio * track.n_matches
-        if n_inliers >= max(config.min_inliers_lost, plausible):
+        if not self.stands_still and n_inliers >= max(config.min_inliers_lost, plausible):
             return TrackingState.WEAK
         return TrackingState.LOST
 
@@ -310,6 +313,9 @@ class Tracker:
         )
         doubtful = self._is_doubtful(frame, n_inliers, view, frames)
         state = judge(n_matches, n_inliers, self._context)
+        if self.stands_still and state != TrackingState.OK:
+            # Something covers the image of a standing camera. Its few matches may be wrong.
+            state = TrackingState.LOST
         return Found(state, n_matches, n_inliers, visible, is_doubtful=doubtful)
 
     def accept(self, frame: Frame, found: Found, frames: FramePoses, n_keyframes: int) -> None:
@@ -320,9 +326,12 @@ class Tracker:
         relocalised frame gets no twist, because the jump to its pose is not a motion of the camera.
         """
         if not found.relocalised:
-            last = -1 if self.last is None else self.last.index
+            last = len(frames) - 1 if self.last is None else self.last.index
             step = se3_log(orthonormalised(frame.T_cw @ inverse(frames.pose(last))))
-            frame.twist = step / (frame.timestamp - frames.timestamp(last))
+            elapsed = frame.timestamp - frames.timestamp(last)
+            if last == len(frames) - 1:
+                elapsed = _motion_seconds(frames, frame.timestamp)
+            frame.twist = step / elapsed
         if not found.stands_still and found.state == TrackingState.OK:
             self._standstill = self._new_standstill(frame, n_keyframes)
         elif self._standstill is not None:
@@ -499,13 +508,19 @@ class Tracker:
         if self.last is None:
             return False
         config = self._config.relocalization
-        interval = frames.timestamp(-1) - frames.timestamp(-2) if len(frames) > 1 else 0
+        times = frames.recent_timestamps(RECENT)
+        interval = motion_seconds(times) if len(times) > 1 else 0.0
         gap = frame.timestamp - self.last.timestamp > config.doubtful_gap * interval > 0.0
         old = view.n_keyframes > self._config.tracking.young_keyframes
         unpredicted = self.last.twist is None and old
         few = n_inliers < config.doubtful_share * view.n_reference
         sudden = n_inliers < config.doubtful_share * self._n_tracked and old
         return few and (gap or unpredicted or sudden)
+
+
+def _motion_seconds(frames: FramePoses, timestamp: float) -> float:
+    """Return the seconds of motion between the last frame and a frame at ``timestamp``."""
+    return motion_seconds(np.append(frames.recent_timestamps(RECENT - 1), timestamp))
 
 
 def result_of(

@@ -107,6 +107,10 @@ class FramePoses:
         """Return the timestamp of a frame in seconds. Index -1 is the last frame."""
         return float(self._frames.timestamp[self._number(index)])
 
+    def recent_timestamps(self, n: int) -> NDArray[np.float64]:
+        """Return the timestamps of the last ``n`` frames, or of all frames if there are fewer."""
+        return self._frames.timestamp[max(0, self._n - n) : self._n].copy()
+
     def append(self, timestamp: float, T_cw: Matrix, *, tracked: bool) -> None:
         """Append the pose of the next frame.
 

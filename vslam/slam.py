@@ -327,7 +327,7 @@ class Slam:
         """
         mapper, tracker = self._mapper, self._tracker
         T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
-        by_patches = tracker.track_patches(frame, T_predicted, mapper.view)
+        by_patches = tracker.track_patches(frame, T_predicted, mapper.view, mapper.frames)
         state = tracker.judge_patches(by_patches)
         clock.lap("track")
         if state == TrackingState.OK:

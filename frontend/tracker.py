@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
@@ -69,7 +70,7 @@ class Found:
             relocalised.
         is_doubtful: whether the frame has so few inliers that its matches with landmarks may be
             wrong.
-        stands_still: whether the camera stands still.
+        support, stands_still: see ``TrackResult``.
     """
 
     state: TrackingState
@@ -78,6 +79,7 @@ class Found:
     visible: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     keyframe: int = -1
     is_doubtful: bool = False
+    support: float = math.nan
     stands_still: bool = False
 
     @classmethod
@@ -257,6 +259,7 @@ class Tracker:
             track.n_matches,
             len(track.ids),
             track.visible,
+            support=track.n_trusted / max(1, track.n_expected),
             stands_still=track.stands_still,
         )
 
@@ -545,4 +548,6 @@ def result_of(
         stage_ms=stage_ms,
         T_odom_camera=odometry.T_odom_camera,
         uncertainty=odometry.now,
+        support=found.support,
+        stands_still=found.stands_still,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple
@@ -306,6 +307,10 @@ class TrackResult:
             frame, which is the first frame of a new map. If the camera was lost and no place was
             recognised, another part begins at a predicted pose. When a loop joins two parts, the
             later frames have the smaller index.
+        support: share of the landmarks at rest that should be visible and that agree with the pose.
+            It is small if a large part of the image moves against the rest, or is covered. NaN for
+            a frame that was not tracked by patches.
+        stands_still: whether the camera stands still.
     """
 
     index: int
@@ -322,6 +327,8 @@ class TrackResult:
     T_odom_camera: NDArray[np.float64] | None = None
     uncertainty: PoseUncertainty | None = None
     part: int = 0
+    support: float = math.nan
+    stands_still: bool = False
 
     @property
     def measured(self) -> bool:

@@ -30,6 +30,7 @@ from vslam.map import Map
 from vslam.maps.storage import made_with
 from vslam.plugins import reason
 from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
+from vslam.run.moving_objects import moving_object_warnings
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome, causal_trajectory, ground_truth_of
 from vslam.run.pair import PairCheck
@@ -376,6 +377,7 @@ def _source_warnings(source: Source, run: _Run) -> list[str]:
         *jitter_warnings(times, source.name),
         *calibration_warnings(source.camera, run.settings.calib, source.name),
         *run.pair.warnings(),
+        *moving_object_warnings(run.tracks),
     ]
 
 

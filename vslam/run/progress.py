@@ -22,9 +22,9 @@ from vslam.maps.new_output import replaced_file
 from vslam.odometry import N_NUMBERS, PoseUncertainty
 from vslam.untrusted import ARCHIVE_ERRORS, read_json, read_npz
 
-SCHEMA = 5
+SCHEMA = 6
 _STATES = tuple(TrackingState)
-_POSE, _NUMBERS = 16, 7 + 16 + N_NUMBERS  # columns of the pose, and of the numbers after it
+_POSE, _NUMBERS = 16, 8 + 16 + N_NUMBERS  # columns of the pose, and of the numbers after it
 _UNKNOWN = np.full(N_NUMBERS, np.nan)
 
 
@@ -33,9 +33,10 @@ class TrackTable:
     """Tracking results of N frames, in order.
 
     Attributes:
-        rows: ``(N, 109)`` float64, one row for each frame: ``T_wc`` row by row, the timestamp, the
-            state, the numbers of features, stereo features, matches and inliers, a sum (1 for a
-            keyframe, 2 for a relocalised frame, and 4 times the part), ``T_odom_camera`` row by
+        rows: ``(N, 110)`` float64, one row for each frame: ``T_wc`` row by row, the timestamp, the
+            state, the numbers of features, stereo features, matches and inliers, the support, a sum
+            (1 for a keyframe, 2 for a relocalised frame, 4 if the camera stands still, and 8 times
+            the part), ``T_odom_camera`` row by
             row, and ``PoseUncertainty.numbers``. Unknown numbers are NaN.
         stages: names of the timed stages.
         stage_ms: ``(N, S)`` float64 milliseconds. NaN for a stage that a frame skipped.
@@ -81,8 +82,8 @@ class TrackLog:
         self._rows.extend(track.T_wc.ravel())
         self._rows.extend((
             track.timestamp, _STATES.index(track.state), track.n_features, track.n_stereo,
-            track.n_matches, track.n_inliers,
-            track.is_keyframe + 2 * track.relocalised + 4 * track.part,
+            track.n_matches, track.n_inliers, track.support,
+            track.is_keyframe + 2 * track.relocalised + 4 * track.stands_still + 8 * track.part,
         ))  # fmt: skip
         T_odom, uncertainty = track.T_odom_camera, track.uncertainty
         self._rows.extend(np.full(16, np.nan) if T_odom is None else T_odom.ravel())
@@ -254,7 +255,7 @@ def _checked_table(rows: NDArray, stages: list[str], stage_ms: NDArray) -> Track
 
 
 def _track(index: int, row: NDArray[np.float64], stage_ms: dict[str, float]) -> TrackResult:
-    timestamp, state, *counts, flags = row[_POSE : -16 - N_NUMBERS].tolist()
+    timestamp, state, *counts, support, flags = row[_POSE : -16 - N_NUMBERS].tolist()
     T_odom, numbers = row[-16 - N_NUMBERS : -N_NUMBERS].reshape(4, 4), row[-N_NUMBERS:]
     n_features, n_stereo, n_matches, n_inliers = map(int, counts)
     return TrackResult(
@@ -268,7 +269,9 @@ def _track(index: int, row: NDArray[np.float64], stage_ms: dict[str, float]) -> 
         n_inliers=n_inliers,
         is_keyframe=bool(int(flags) & 1),
         relocalised=bool(int(flags) & 2),
-        part=int(flags) >> 2,
+        part=int(flags) >> 3,
+        support=support,
+        stands_still=bool(int(flags) & 4),
         stage_ms={name: ms for name, ms in stage_ms.items() if np.isfinite(ms)},
         T_odom_camera=T_odom if np.isfinite(T_odom).all() else None,
         uncertainty=PoseUncertainty.of_numbers(numbers) if np.isfinite(numbers).all() else None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
@@ -79,7 +78,7 @@ class Found:
     visible: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     keyframe: int = -1
     is_doubtful: bool = False
-    support: float = math.nan
+    support: float | None = None
     stands_still: bool = False
 
     @classmethod

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple
@@ -308,7 +307,7 @@ class TrackResult:
             recognised, another part begins at a predicted pose. When a loop joins two parts, the
             later frames have the smaller index.
         support: share of the landmarks at rest that should be visible and that agree with the pose.
-            It is small if a large part of the image moves against the rest, or is covered. NaN for
+            It is small if a large part of the image moves against the rest, or is covered. None for
             a frame that was not tracked by patches.
         stands_still: whether the camera stands still.
     """
@@ -327,7 +326,7 @@ class TrackResult:
     T_odom_camera: NDArray[np.float64] | None = None
     uncertainty: PoseUncertainty | None = None
     part: int = 0
-    support: float = math.nan
+    support: float | None = None
     stands_still: bool = False
 
     @property

@@ -15,7 +15,7 @@ def moving_object_warnings(tracks: Sequence[TrackResult]) -> list[str]:
     something moved in front of the camera or covered it."""
     runs: list[list[TrackResult]] = [[]]
     for track in tracks:
-        if track.support < _LITTLE:
+        if track.support is not None and track.support < _LITTLE:
             runs[-1].append(track)
         elif runs[-1]:
             runs.append([])
@@ -24,7 +24,7 @@ def moving_object_warnings(tracks: Sequence[TrackResult]) -> list[str]:
         return []
     first, last = long[0][0].index, long[0][-1].index
     more = f" and {len(long) - 1} more times" if len(long) > 1 else ""
-    least = min(track.support for run in long for track in run)
+    least = min(track.support or 0.0 for run in long for track in run)
     return [
         f"In frames {first} to {last}{more}, a large part of the image moved against the rest or "
         f"was covered: the poses rely on as little as {100 * least:.0f} % of the landmarks that "

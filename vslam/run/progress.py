@@ -7,6 +7,7 @@ both files.
 from __future__ import annotations
 
 import json
+import math
 from array import array
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -82,7 +83,8 @@ class TrackLog:
         self._rows.extend(track.T_wc.ravel())
         self._rows.extend((
             track.timestamp, _STATES.index(track.state), track.n_features, track.n_stereo,
-            track.n_matches, track.n_inliers, track.support,
+            track.n_matches, track.n_inliers,
+            math.nan if track.support is None else track.support,
             track.is_keyframe + 2 * track.relocalised + 4 * track.stands_still + 8 * track.part,
         ))  # fmt: skip
         T_odom, uncertainty = track.T_odom_camera, track.uncertainty
@@ -270,7 +272,7 @@ def _track(index: int, row: NDArray[np.float64], stage_ms: dict[str, float]) -> 
         is_keyframe=bool(int(flags) & 1),
         relocalised=bool(int(flags) & 2),
         part=int(flags) >> 3,
-        support=support,
+        support=support if math.isfinite(support) else None,
         stands_still=bool(int(flags) & 4),
         stage_ms={name: ms for name, ms in stage_ms.items() if np.isfinite(ms)},
         T_odom_camera=T_odom if np.isfinite(T_odom).all() else None,

@@ -413,15 +413,6 @@ def entry(part: str, **fields: object):
     return pytest.param(apply, id=next(iter(fields)))
 
 
-def test_the_odometry_of_an_older_version_has_no_gaps(at_checkpoint, tmp_path):
-    """Older versions did not store the covariance of the gaps, which has 21 numbers."""
-    state = header_of(at_checkpoint)["checkpoint"]["odometry"]
-    header = header_of(at_checkpoint)
-    header["checkpoint"]["odometry"] = state[:16] + state[37:]
-    old = load_checkpoint(changed(at_checkpoint, tmp_path / "old.npz", header=as_header(header)))
-    assert old.checkpoint.odometry == (*state[:16], *[0.0] * 21, *state[37:])
-
-
 def without_checkpoint(file: Path, to: Path) -> Path:
     return changed(file, to, header=as_header(header_of(file) | {"checkpoint": None}))
 

@@ -188,7 +188,7 @@ def checked_checkpoint(
             _count(policy["due"], -1),
         ),
         closing=_closing_of(entry["closing"], map_.n_keyframes),
-        odometry=_odometry(entry["odometry"]),
+        odometry=tuple(_numbers(entry["odometry"], N_STATE).tolist()),
         rig=RigState(
             **{name: tuple(_numbers(entry["rig"][name]).tolist()) for name in ("delay", "sides")}
         ),
@@ -212,14 +212,6 @@ def _numbers(values: Any, count: int | None = None) -> NDArray[np.float64]:
     if found.ndim != 1 or len(found) != (count or len(found)) or not (np.abs(found) < _MOST).all():
         raise ValueError("numbers are out of range")
     return found
-
-
-def _odometry(values: Any) -> tuple[float, ...]:
-    """Read the state of the odometry. Older versions did not store ``PoseUncertainty.gaps``."""
-    found = _numbers(values).tolist()
-    if len(found) == N_STATE - 21:
-        found[16:16] = [0.0] * 21
-    return tuple(_numbers(found, N_STATE).tolist())
 
 
 def _pose(values: Any) -> NDArray[np.float64]:

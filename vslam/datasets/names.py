@@ -42,7 +42,8 @@ def pair_names(
     Returns:
         None if the names do not tell which images belong together.
     """
-    keys = _keys(first), _keys(second)
+    parts = _keys(first), _keys(second)
+    keys = parts if all(parts) else ([(name,) for name in first], [(name,) for name in second])
     numbers = _relative(*map(_numbers, keys)) or (None if times is None else _relative(*times))
     if numbers is not None:
         return pair_clocks(*numbers) or _same_steps(*numbers)
@@ -118,16 +119,14 @@ def _same_steps(first: NDArray[np.float64], second: NDArray[np.float64]) -> Cloc
 def _keys(names: Several[str]) -> list[_Key]:
     """Split names into numbers and other text, and keep only the parts that vary.
 
-    The key of a name is the whole name if the names differ in structure or if the keys would not be
-    unique.
+    The result is empty if the names differ in structure or if the keys would not be unique.
     """
-    whole: list[_Key] = [(name,) for name in names]
     rows = [[_parsed(token) for token in _TOKENS.findall(name)] for name in names]
     if len({tuple(isinstance(part, str) for part in row) for row in rows}) > 1:
-        return whole
+        return []
     columns = [column for column in zip(*rows, strict=True) if len(set(column)) > 1]
     keys = list(zip(*columns, strict=True))
-    return keys if len(set(keys)) == len(names) else whole
+    return keys if len(set(keys)) == len(names) else []
 
 
 def _parsed(token: str) -> int | float | str:

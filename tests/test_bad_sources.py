@@ -280,7 +280,7 @@ def test_folders_of_images(folder, corridor, tmp_path):
     times.write_text("0.0\n0.1\n")
     refused("times.txt: 2 times for 3 images", "images", tmp_path, options)
     times.write_text("0\n1\n2\n")
-    refused("0, 1, 2, ... are the numbers of frames, .* --fps", "images", tmp_path, options)
+    refused("0, 1, 2, ... look like the numbers of frames, .* --fps", "images", tmp_path, options)
     times.write_text("0.0\n0.2\n0.1\n")
     refused("1 of 3 times are not later .*time 3 .* give --fps", "images", tmp_path, options)
     refused("no such folder", "images", tmp_path / "none", options)

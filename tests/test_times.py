@@ -114,7 +114,9 @@ def test_lists_in_their_usual_unit_stay_as_they_are(step, first):
 @pytest.mark.parametrize("numbers", [[0, 1, 2, 3], [1.0, 2.0, 4.0, 5.0, 6.0], [1100, 1101, 1102]])
 @pytest.mark.parametrize("usual", ["seconds", "nanoseconds"])
 def test_the_numbers_of_frames_are_no_list_of_times(numbers, usual):
-    with pytest.raises(InputError, match=r"here: \d+, \d+, \d+, \.\.\. are the numbers of frames"):
+    with pytest.raises(
+        InputError, match=r"here: \d+, \d+, \d+, \.\.\. look like the numbers of frames"
+    ):
         unit_of_list(numbers, HERE, usual, "give --fps")
 
 

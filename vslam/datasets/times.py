@@ -394,7 +394,9 @@ def unit_of_list(numbers: Several[Number], path: Path, usual: str, fix: str) -> 
     by_one = sum(b - a == 1 for a, b in pairwise(numbers))  # type: ignore[operator]
     if len(numbers) > _TOO_FEW and whole and 2 * by_one > len(numbers) - 1:
         first = ", ".join(f"{int(number)}" for number in numbers[:3])
-        raise InputError(f"{path}: {first}, ... are the numbers of frames, not their times; {fix}.")
+        raise InputError(
+            f"{path}: {first}, ... look like the numbers of frames, not their times; {fix}."
+        )
     unit, remark = _unit_of(numbers, f"{path}: the times", usual, fix)
     return unit, Timing(str(path), [f"{remark}."] * bool(remark))
 

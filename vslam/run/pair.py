@@ -42,6 +42,7 @@ _FEATURES = 500
 _FEWEST = 30  # matches
 _MANY = 250  # features; if two such images have no match, they show different scenes
 _LAGS = 4  # frames
+_TITLE = 30  # frames at the start that may show the same picture in both images, such as a title
 # Largest mean difference of grey values if the camera is at rest, in images that are scaled to an
 # eighth. It is 0.4 to 0.7 at the start of EuRoC's V1_01, and at least 12 on drives.
 _AT_REST = 1.5
@@ -115,8 +116,10 @@ def how_to_swap(dataset: str, options: RunOptions) -> str:
 class PairCheck:
     """Checks a few of the first frames before they are perturbed.
 
-    The checks end as soon as the images of a moving camera are found to be in order. A fault is
-    reported only if it is found at two different times. Images with few matches prove nothing.
+    The checks end as soon as the images of a moving camera are found to be in order. A fault that
+    ends the run is found in one pair, except that images are only the same if later ones are, too.
+    Any other fault is reported only if it is found at two different times. Images with few matches
+    prove nothing.
     """
 
     def __init__(self, camera: Camera, dataset: str, options: RunOptions) -> None:
@@ -130,7 +133,7 @@ class PairCheck:
         return [said[-1] for said in self._found.values() if len(said) == _AGREEING]
 
     def watch(self, frames: Iterator[TimedFrame]) -> Iterator[TimedFrame]:
-        """Yield all frames. For a check, a few frames are read in advance.
+        """Yield all frames. For a check, some frames are read in advance.
 
         Raises:
             InputError: the left and the right images are the same, or left and right are swapped.
@@ -149,7 +152,7 @@ class PairCheck:
         """Check the pair of the next frame. ``ahead`` holds the frames that have been read."""
         views: list[_View] = []
         for n in (2, 1 + _LAGS):  # if there is a fault, more frames tell whether one side is late
-            ahead.extend(islice(frames, n - len(ahead)))
+            ahead.extend(islice(frames, max(n - len(ahead), 0)))
             views += [_View(ahead[k]) for k in range(len(views), len(ahead))]
             if not views or (self._n_judged and not self._found and _at_rest(views)):
                 return
@@ -157,9 +160,9 @@ class PairCheck:
             if fault in ("", "good"):
                 break
         self._n_judged += 1
-        if fault in ("same", "swapped"):
+        if fault == "swapped" or (fault == "same" and _stays_the_same(ahead, frames)):
             raise InputError(said)
-        if fault not in ("", "good"):
+        if fault not in ("", "good", "same"):
             self._found.setdefault(fault, []).append(said)
         decided = fault == "good" or bool(self.warnings())
         self._open = not decided and self._n_judged < _MOST_JUDGED
@@ -238,6 +241,17 @@ def _judge(views: Several[_View], fix_sides: str) -> tuple[str, str]:
         )
     others = [error for other, error in rows.items() if other]
     return ("good" if min(others, default=0.0) > rows[0] + _LAG_GAIN_PX else ""), ""
+
+
+def _stays_the_same(ahead: deque[TimedFrame], frames: Iterator[TimedFrame]) -> bool:
+    """Return whether no later pair differs from a pair of the same images. ``ahead`` holds the
+    frames that have been read. More frames are read."""
+    ahead.extend(islice(frames, max(_TITLE - len(ahead), 0)))
+    for view in (_View(ahead[len(ahead) // 2]), _View(ahead[-1])):
+        matches = match_described(view.left_features, view.right_features)
+        if len(matches) >= _FEWEST and judge_sides(matches) != "same":
+            return False
+    return True
 
 
 def _at_rest(views: Several[_View]) -> bool:

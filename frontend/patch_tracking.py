@@ -18,7 +18,7 @@ from vslam.features import PATCH_RADIUS, Features, Pyramid
 from vslam.frontend.alignment import find_patches
 from vslam.frontend.masks import Mask
 from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
-from vslam.frontend.standstill import KEEP_LEAST, Standstill, is_small, still_stands
+from vslam.frontend.standstill import MEASURE_SHARE, Standstill, is_small, still_stands
 from vslam.frontend.tracking import TrackingContext, predict_landmarks, trusted_landmarks
 from vslam.geometry import Matrix, orthonormalised, transform
 from vslam.map_view import MapView
@@ -153,7 +153,8 @@ def track_standing(
     if not still_stands(stayed, is_small(flow - moved[:, :2], scale), close):
         return NO_PATCHES_FOUND
     track = _optimised(found.select(stayed), T_cw, view, context, ask_trusted=False)
-    if np.count_nonzero(stayed) < KEEP_LEAST:  # too few to measure the pose better than before
+    if np.count_nonzero(stayed) < MEASURE_SHARE * len(standstill.ids):
+        # The rest is covered. What is left measures the pose worse than the last frame did.
         track = track._replace(T_cw=T_cw)
     return track._replace(stands_still=True)
 

@@ -18,13 +18,15 @@ from vslam.geometry import Matrix
 STAY = 0.4  # largest motion of a static landmark, pixels of its octave; patches are found to 0.1 px
 BEGIN_SHARE = 0.8  # the camera has come to rest if this share of the landmarks did not move
 # The camera still stands if this share of the close landmarks did not move, because they move at
-# once when the camera moves off. Either this number of landmarks did not move, or hardly any
-# landmark moved and there are enough to determine the pose.
+# once when the camera moves off. If fewer landmarks than KEEP_LEAST did not move, because something
+# covers the image, these must be at least FEWEST, and half of those that were found. If one motion
+# explains all of them, they must be BEGIN_SHARE of those that were found.
 KEEP_SHARE, KEEP_LEAST = 0.15, 40
 FEWEST = 15
 # The camera has moved off if less than half of the landmarks stayed, and if one motion explains
 # where at least this share of the landmarks went.
 MOVED_SHARE = 0.9
+MEASURE_SHARE = 0.25  # share of the landmarks that are enough to measure the pose of the camera
 
 
 @dataclass(frozen=True)
@@ -87,8 +89,11 @@ def still_stands(
         close: ``(M,)`` bool, the landmarks that are so close that they would move in the image.
     """
     n_stayed = np.count_nonzero(stayed)
+    if n_stayed < FEWEST:
+        return False
     if n_stayed < KEEP_LEAST:
-        return bool(n_stayed >= max(FEWEST, BEGIN_SHARE * len(stayed)))
+        share = BEGIN_SHARE if np.mean(follows) >= MOVED_SHARE else 0.5
+        return bool(n_stayed >= share * len(stayed))
     if np.count_nonzero(close) >= KEEP_LEAST:
         stayed, follows = stayed[close], follows[close]
     if np.mean(stayed) < 0.5 and np.mean(follows) >= MOVED_SHARE:

@@ -315,8 +315,10 @@ class Tracker:
         )
         doubtful = self._is_doubtful(frame, n_inliers, view, frames)
         state = judge(n_matches, n_inliers, self._context)
-        if self.stands_still and state != TrackingState.OK:
-            # Something covers the image of a standing camera. Its few matches may be wrong.
+        n_trusted = np.count_nonzero(view.local_landmarks.confirms(frame.landmark))
+        if self.stands_still and (state != TrackingState.OK or n_trusted < MIN_TRUSTED):
+            # Something covers the image of a standing camera. The matches may be wrong, or belong
+            # to a moving object.
             state = TrackingState.LOST
         return Found(state, n_matches, n_inliers, visible, is_doubtful=doubtful)
 

@@ -137,7 +137,9 @@ class MapBuilding(Mode):
             seconds_since_keyframe=frame.timestamp - self._mapper.last_timestamp,
             mapping_idle=self._mapper.is_merged,
         )
-        if self._stays_at_reference(frame) or not self._is_keyframe(frame, evidence):
+        if found.stands_still or self._stays_at_reference(frame):
+            return False  # only a moving object could show something new
+        if not self._is_keyframe(frame, evidence):
             return False
         self._mapper.settle()
         if not self._match_features(frame) or self._use_existing_keyframe(frame):
@@ -147,8 +149,7 @@ class MapBuilding(Mode):
         return True
 
     def _stays_at_reference(self, frame: PlacedFrame) -> bool:
-        """Return whether the camera stands still at its reference keyframe. Only a moving object
-        could then show something new."""
+        """Return whether the camera has come to rest at its reference keyframe."""
         if not self._tracker.stands_still:
             return False
         moved = se3_log(orthonormalised(frame.T_cw @ inverse(self._mapper.view.T_reference)))

@@ -31,11 +31,16 @@ def noise(n: int = 3) -> list[np.ndarray]:
     return [rng.integers(0, 256, (48, 64), dtype=np.uint8) for _ in range(n)]
 
 
+def stereo() -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return three images of a wall for each camera. Copies of one image would be refused."""
+    return noise(), [np.roll(image, -4, axis=1) for image in noise()]
+
+
 def images(folder: Path) -> None:
     from source_files import write_calibration, write_images
 
     names = [f"{k}.png" for k in range(3)]
-    write_images(folder, {"left": noise(), "right": noise()}, names)
+    write_images(folder, dict(zip(("left", "right"), stereo(), strict=True)), names)
     (folder / "times.txt").write_text("0.0\n0.1\n0.2\n")
     write_calibration(folder / "stereo.yaml", _camera())
 
@@ -58,9 +63,9 @@ def kitti(folder: Path) -> None:
     from vslam.trajectory import write_kitti
 
     sequence = folder / "sequences" / "00"
-    for side in ("image_0", "image_1"):
+    for side, images in zip(("image_0", "image_1"), stereo(), strict=True):
         (sequence / side).mkdir(parents=True)
-        for k, image in enumerate(noise()):
+        for k, image in enumerate(images):
             cv2.imwrite(str(sequence / side / f"{k:06d}.png"), image)
     c = _camera()
     rows = (
@@ -92,11 +97,11 @@ def tum(folder: Path) -> None:
 def euroc(folder: Path) -> None:
     import cv2
 
-    for side in range(2):
+    for side, images in enumerate(stereo()):
         camera = folder / "mav0" / f"cam{side}"
         (camera / "data").mkdir(parents=True)
         lines = ["#timestamp [ns],filename\n"]
-        for k, image in enumerate(noise()):
+        for k, image in enumerate(images):
             stamp = 1_403_636_579_763_555_584 + 50_000_000 * k
             cv2.imwrite(str(camera / "data" / f"{stamp}.png"), image)
             lines.append(f"{stamp},{stamp}.png\n")
@@ -157,7 +162,7 @@ def calibrations(folder: Path) -> None:
 def bag(kind: str, encoding: str, folder: Path, compression: str = "") -> None:
     from source_files import LEFT, RIGHT, write_bag
 
-    sides = {LEFT: noise(), RIGHT: noise()}
+    sides = dict(zip((LEFT, RIGHT), stereo(), strict=True))
     name = {"ros1": "a.bag"}.get(kind, "a")
     write_bag(folder / name, kind, sides, [10**8 * (k + 1) for k in range(3)], encoding=encoding,
               camera=_camera(), compression=compression)  # fmt: skip

@@ -57,6 +57,7 @@ from vslam.features import Extracted, Features
 from vslam.frontend import pnp
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.frame import Frame
+from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
 from vslam.frontend.relocaliser import relocalise
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import TrackingContext
@@ -207,6 +208,15 @@ def run_slam(config: Config, frames: int) -> None:
     slam.trajectory()
 
 
+def compile_trusted_pose() -> None:
+    """Compile the search for a pose by trusted landmarks, beside an object that moves."""
+    points = np.random.default_rng(0).uniform([-4.0, -2.0, 9.0], [4.0, 2.0, 12.0], (200, 3))
+    trusted = np.arange(len(points)) < 2 * MIN_TRUSTED
+    uvr = CAMERA.project(points + np.where(trusted, 0.0, 0.5)[:, None])
+    weights = np.ones(len(points))
+    optimise_pose(np.eye(4), points, uvr, weights, CAMERA.intrinsics, trusted=trusted)
+
+
 def compile_depth() -> None:
     """Compile the kernels that take the depths of keypoints from a depth image."""
     depth, scale = np.ones((8, 8), np.float32), np.ones(1)
@@ -335,7 +345,13 @@ def compile_bundle_adjustment() -> None:
 # starts with the insertion of keyframes, so that the kernels of the insertion are cached before the
 # second process calls them.
 COMPILE_SHARES: dict[str, tuple[Callable[[], None], ...]] = {
-    "first": (compile_insertion, compile_tracking, compile_depth, compile_recognition),
+    "first": (
+        compile_insertion,
+        compile_tracking,
+        compile_trusted_pose,
+        compile_depth,
+        compile_recognition,
+    ),
     "second": (
         compile_bundle_adjustment,
         compile_local_mapping,
@@ -346,6 +362,7 @@ COMPILE_SHARES: dict[str, tuple[Callable[[], None], ...]] = {
 }
 EVERYTHING: tuple[Callable[[], None], ...] = (
     run_everything,
+    compile_trusted_pose,
     compile_depth,
     compile_recognition,
     compile_learned_matching,

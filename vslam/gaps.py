@@ -28,7 +28,7 @@ class GapKind(StrEnum):
     PREDICTED: the camera was lost before the stretch, and its motion was predicted from its
     velocity. UNKNOWN: the camera was lost before the stretch, and its velocity was unknown.
     START: the frames were lost before the camera was tracked for the first time. END: the frames
-    were lost, and the camera was not tracked again.
+    were lost or dropped, and the camera was not tracked again.
     """
 
     PREDICTED = "predicted"
@@ -165,8 +165,8 @@ def _sentence(gap: Gap, n_frames: int, unit: str) -> str:
         off = f"{_short(gap.sigma_m)} {unit} and {gap.sigma_deg:.0f} degrees (standard deviations)"
     if gap.kind == GapKind.END:
         return (
-            f"{frames} at the end {were} lost: {their} predicted from the last velocity, and after "
-            f"{gap.seconds:.1f} s may be off by {off}."
+            f"{frames} at the end {were} not tracked: {their} predicted from the last velocity, "
+            f"and after {gap.seconds:.1f} s may be off by {off}."
         )
     if gap.last == n_frames - 1 and not one:
         frames = f"All frames from frame {gap.first} on"

@@ -4,7 +4,7 @@ Images are ``sensor_msgs/Image`` or ``CompressedImage`` messages, or Foxglove's 
 ``CompressedImage``. Their time stamps are taken from the message headers.
 
 The images of two topics are paired by time. The two images of a stereo pair are at most 5 ms apart.
-An image and its depth are at most 20 ms apart. Images without a partner are skipped.
+An image and its depth are at most 20 ms apart. Images without a partner are left out.
 
 If the bag has ``camera_info`` topics, the calibration is read from them.
 """

@@ -441,8 +441,8 @@ def _unit_of(numbers: Several[Number], what: str, usual: str | None, fix: str) -
             f"can have, neither in seconds nor in ms, us or ns; {fix}."
         )
     unit = min(possible, key=lambda name: abs(np.log(seconds[name] / _TYPICAL_S)))
-    since = " since the camera was switched on" if usual is None else f", not {usual}"
-    return unit, f"{what} are read as {unit}{since}: {rate_text(seconds[unit])}"
+    instead = "" if usual is None else f", not {usual}"
+    return unit, f"{what} are read as {unit}{instead}: {rate_text(seconds[unit])}"
 
 
 def _interval(numbers: Several[Number]) -> float | None:

@@ -266,7 +266,7 @@ def check_times(timestamps: Times, timing: Timing | None = None) -> list[Finding
         "frame rate",
         not is_frame_rate(interval),
         "; ".join([rate_text(interval), *(remark.rstrip(".") for remark in timing.remarks)]),
-        "correct the unit of the times; if it is right, record more frames",
+        "correct the unit of the times, or record 0.2 to 1250 frames per second",
     )
     gaps = steps > GAP * interval
     longest = int(np.argmax(steps))

@@ -373,10 +373,11 @@ def _associate(estimate: Trajectory, ground_truth: Trajectory) -> _Pair:
     T_wc, between = poses_at(Trajectory(true_times, ground_truth.T_wc), times)
     known = np.flatnonzero(np.isfinite(T_wc).all((1, 2)))
     if not len(known):
+        own, true = "the times of the trajectory", "those of the ground truth"
         raise InputError(
             f"none of the {len(estimate)} poses lies within {1000 * MAX_TIME_DIFFERENCE_S:.0f} ms "
             f"of any of the {len(ground_truth)} poses of the ground truth: "
-            f"{said_of_clocks('its times', times, 'those of the ground truth', true_times)}."
+            f"{said_of_clocks(own, times, true, true_times)}."
         )
     return _Pair(
         Trajectory(times, estimate.T_wc).select(known),

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from parts import CAMERA, Points
+from parts import CAMERA, Points, ahead
 from test_mapper import Drive, at, begin_with_two_views, bytes_of_map, see_points, see_without_depth
 
 from vslam.camera import Camera
 from vslam.features import Side, TrackingState
 from vslam.frontend.frame import Frame
+from vslam.frontend.standstill import Standstill
 from vslam.frontend.tracker import Found, Tracker
 from vslam.map_frames import OldPlace
 from vslam.modes import MapBuilding, Mode
@@ -44,6 +47,10 @@ class Building(Drive):
         self.mapper.hold(frame)
         self.mapper.append_pose(frame, tracked=tracked)
         return frame
+
+    def stand_still(self) -> None:
+        ids, xy = np.arange(50, dtype=np.int32), np.zeros((50, 2), np.float32)
+        self.tracker._standstill = Standstill(np.eye(4), ids, xy, self.mapper.n_keyframes)
 
     def lost_frame(self, n: int) -> Frame:
         """Return the last one of n lost frames."""
@@ -164,6 +171,16 @@ def test_a_lost_monocular_camera_looks_for_a_first_view_after_four_frames():
     assert drive.mode.state() is None  # a view waits for the second one
 
 
+@pytest.mark.parametrize(("seconds", "begun"), [(4.9, False), (5.1, True)])
+def test_a_standing_camera_waits_until_what_covers_its_view_has_passed(seconds, begun):
+    drive = Building.with_a_map()
+    drive.tracker.start_from(drive.placed_frame())
+    drive.stand_still()
+    frame = drive.lost_frame(30)
+    frame.timestamp = drive.tracker.last.timestamp + seconds
+    assert drive.mode.begin_after_loss(frame) == begun
+
+
 # -- more of a young map --------------------------------------------------------------------------
 
 
@@ -222,6 +239,31 @@ def test_a_frame_becomes_a_keyframe_when_it_is_time():
     assert drive.mapper.last_frame == 8
     assert drive.mode.state().gain_awaited
     assert not drive.mapper.is_merged
+
+
+@pytest.mark.parametrize("stands_still", [True, False])
+def test_a_frame_of_a_standing_camera_becomes_no_keyframe(stands_still):
+    drive = Building.with_a_map(max_interval_s=0.05)
+    frame = drive.placed_frame()
+    says = replace(found(frame), stands_still=stands_still)
+    assert drive.mode.update_map(frame, says) != stands_still
+
+
+@pytest.mark.parametrize(("metres", "pixels", "stays"), [
+    (0.049, 0.0, True),
+    (0.051, 0.0, False),
+    (0.0, 2.9, True),
+    (0.0, 3.1, False),
+])  # fmt: skip
+def test_a_camera_that_comes_to_rest_at_its_reference_keyframe_makes_no_other(
+    metres, pixels, stays
+):
+    """Another keyframe is made if it has moved by a tenth of the baseline, or by three pixels."""
+    drive = Building.with_a_map(max_interval_s=0.05)
+    frame = drive.placed_frame()
+    frame.T_cw = ahead(metres, pixels / CAMERA.fx) @ drive.mapper.view.T_reference
+    drive.stand_still()
+    assert drive.mode.update_map(frame, found(frame)) != stays
 
 
 def test_a_frame_of_the_right_camera_becomes_no_keyframe():

@@ -164,3 +164,64 @@ def test_solve_positive_solves_and_gives_zeros_where_it_cannot():
     H, b = A.T @ A, rng.normal(size=6)
     np.testing.assert_allclose(solve_positive(H, b), np.linalg.solve(H, b), rtol=1e-10)
     assert np.array_equal(solve_positive(-H, b), np.zeros(6))
+
+
+# -- landmarks that are known to be at rest -------------------------------------------------------
+
+OBJECT = se3_exp(np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])) @ TRUTH  # the pose relative to an object
+
+
+def seen_from(*groups: tuple[np.ndarray, float, int]):
+    """Make observations of groups of points. Each group has its own pose of the camera, its
+    greatest depth in metres, and its number of points."""
+    rng, points, seen = np.random.default_rng(5), [], []
+    for T_cw, depth, n in groups:
+        pixels = rng.uniform([0, 0], [CAMERA.width, CAMERA.height], (n, 2))
+        in_camera = CAMERA.backproject(pixels, rng.uniform(0.5 * depth, depth, n))
+        points.append(transform(inverse(T_cw), in_camera))
+        seen.append(CAMERA.project(in_camera))
+    return np.vstack(points), np.vstack(seen)
+
+
+def follow(points, uvr, trusted) -> tuple[np.ndarray, np.ndarray]:
+    weight = np.ones(len(points))
+    return optimise_pose(OBJECT, points, uvr, weight, CAMERA.intrinsics, trusted=trusted)
+
+
+def test_landmarks_at_rest_decide_against_a_moving_object_with_more_landmarks():
+    points, uvr = seen_from((TRUTH, 20.0, 60), (OBJECT, 20.0, 200))
+    at_rest = np.arange(260) < 60
+    for unknown in (None, np.zeros(260, np.bool_)):
+        T, inlier = follow(points, uvr, unknown)
+        assert pose_difference(T, OBJECT) < 1e-6
+        np.testing.assert_array_equal(inlier, ~at_rest)
+    # Every landmark that agrees is used, whether it is trusted or not.
+    trusted = np.arange(260) < 40
+    trusted[250:] = True
+    T, inlier = follow(points, uvr, trusted)
+    assert pose_difference(T, TRUTH) < 1e-6
+    np.testing.assert_array_equal(inlier, at_rest)
+
+
+@pytest.mark.parametrize(("n_trusted", "expected"), [(30, TRUTH), (29, OBJECT)])
+def test_few_trusted_landmarks_do_not_decide(n_trusted, expected):
+    points, uvr = seen_from((TRUTH, 20.0, 60), (OBJECT, 20.0, 200))
+    T, _ = follow(points, uvr, np.arange(260) < n_trusted)
+    assert pose_difference(T, expected) < 1e-6
+
+
+@pytest.mark.parametrize(("n_agree", "expected"), [(30, TRUTH), (29, OBJECT)])
+def test_trusted_landmarks_that_contradict_each_other_do_not_decide(n_agree, expected):
+    points, uvr = seen_from((TRUTH, 20.0, 40), (OBJECT, 20.0, 200))
+    away = np.random.default_rng(2).choice([-40.0, 40.0], (40 - n_agree, 1))
+    uvr[n_agree:40] += away * [0.5, 1.0, 0.5]
+    T, _ = follow(points, uvr, np.arange(240) < 40)
+    assert pose_difference(T, expected) < 1e-6
+
+
+@pytest.mark.parametrize(("n_far", "expected"), [(70, OBJECT), (69, TRUTH)])
+def test_a_pose_with_which_most_trusted_landmarks_agree_is_kept(n_far, expected):
+    """Landmarks that are 4 km away agree with both poses."""
+    points, uvr = seen_from((TRUTH, 4000.0, n_far), (TRUTH, 20.0, 100 - n_far), (OBJECT, 20.0, 200))
+    T, _ = follow(points, uvr, np.arange(300) < 100)
+    assert pose_difference(T, expected) < 0.02

@@ -9,11 +9,17 @@ import pytest
 from parts import ALL, CAMERA, NOTHING, OneKeyframe, Points, ahead, frame_of
 
 from vslam.config import Config
-from vslam.features import Features, TrackingState
+from vslam.features import NO_PATCHES, Features, TrackingState
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
+from vslam.frontend.patch_tracking import NO_PATCHES_FOUND, PatchTrack
 from vslam.frontend.tracker import Found, Tracker, TrackerStatus, judge
-from vslam.frontend.tracking import TrackingContext, track_motion
+from vslam.frontend.tracking import (
+    TrackingContext,
+    track_descriptors,
+    track_motion,
+    trusted_landmarks,
+)
 from vslam.geometry import se3_exp
 from vslam.map_view import NO_LANDMARKS, MapView
 
@@ -318,6 +324,280 @@ def test_few_inliers_make_a_frame_weak_or_lost(n_matches, n_inliers, state):
 def test_a_small_share_of_inliers_makes_a_frame_of_a_depth_camera_lost(n_inliers, state):
     context = TrackingContext.create(replace(CAMERA, depth=True), Config())
     assert judge(200, n_inliers, context) == state
+
+
+# -- moving objects -------------------------------------------------------------------------------
+
+OBJECT = ahead(0.0, 60 / CAMERA.fx)  # motion of the camera relative to a moving object
+
+
+def see_object(static: slice, moving: slice, T_static: np.ndarray, T_object: np.ndarray) -> Frame:
+    """Return frame 2, which sees points at rest from one pose, and an object from another pose."""
+    at_rest, others = POINTS.see(T_static, static), POINTS.see(T_object, moving)
+    names = ("xy", "octave", "angle", "descriptors", "u_right")
+    joined = (np.concatenate([getattr(x, name) for x in (at_rest, others)]) for name in names)
+    return frame_of(Features(*joined), 2, 0.2)
+
+
+def test_descriptors_find_the_pose_of_most_landmarks_although_an_object_was_nearer():
+    unknown = POINTS.landmarks()._replace(confirmed=np.zeros(240, np.bool_))
+    frame = see_object(slice(0, 140), slice(140, 240), at(2), OBJECT @ at(2))
+    assert track_descriptors(frame, unknown, OBJECT @ at(2), CONTEXT) == 140
+    np.testing.assert_allclose(frame.T_cw, at(2), atol=1e-4)
+    assert (frame.landmark[140:] == -1).all()
+
+
+@pytest.mark.parametrize(("n_close", "n_chosen"), [(30, 30), (29, 79)])
+def test_close_confirmed_landmarks_are_trusted_unless_they_are_few(n_close, n_chosen):
+    """Landmarks nearer than 20 m are close."""
+    depth = np.repeat([19.0, 21.0, 5.0], [n_close, 50, 10])
+    xyz = np.stack([np.zeros_like(depth), np.zeros_like(depth), depth + 2.0], axis=1)
+    confirmed = np.arange(len(depth)) < n_close + 50
+    chosen = trusted_landmarks(confirmed, xyz, ahead(2.0), CONTEXT)
+    np.testing.assert_array_equal(chosen, np.arange(len(depth)) < n_chosen)
+
+
+def patches(
+    n: int = 300, expected: int = 0, trusted: int = 0, share: float = 1.0, **changes
+) -> PatchTrack:
+    """Return a frame in which n patches agree. ``expected`` trusted landmarks should be visible,
+    and ``trusted`` of them agree."""
+    return NO_PATCHES_FOUND._replace(
+        ids=np.arange(n),
+        n_matches=round(n / share),
+        n_expected=expected,
+        n_trusted=trusted,
+        **changes,
+    )
+
+
+@pytest.mark.parametrize(("expected", "trusted", "support", "lacks"), [
+    (29, 0, 300, False),  # hardly any trusted landmark is expected
+    (30, 15, 15, False),
+    (30, 14, 14, True),
+    (100, 50, 50, False),
+    (100, 49, 49, True),
+])  # fmt: skip
+def test_trusted_landmarks_support_a_pose_if_enough_are_expected(expected, trusted, support, lacks):
+    track = patches(expected=expected, trusted=trusted)
+    assert track.support == support
+    assert track.lacks_support == lacks
+
+
+@pytest.mark.parametrize(("track", "state"), [
+    (patches(expected=30, trusted=30), TrackingState.OK),
+    (patches(expected=30, trusted=29), TrackingState.LOST),
+    (patches(expected=29, trusted=0), TrackingState.OK),
+    (patches(share=0.6), TrackingState.WEAK),
+    (patches(15, stands_still=True, expected=30), TrackingState.OK),
+])  # fmt: skip
+def test_patches_without_trusted_landmarks_are_not_believed(track, state):
+    assert Tracker(CONTEXT).judge_patches(track) == state
+
+
+def test_a_standing_camera_is_not_tracked_by_a_small_share_of_patches():
+    tracker = standing().tracker
+    assert tracker.judge_patches(patches(share=0.6)) == TrackingState.LOST
+    assert tracker.judge_patches(patches()) == TrackingState.OK
+
+
+class Hypotheses:
+    """A tracker whose search for patches is replaced.
+
+    Attributes:
+        tried: the initial poses from which patches were searched for, by name. ``aligned`` and
+            ``confirmed`` are found by image alignment of all landmarks, or of the confirmed ones.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, n_confirmed: int = 240, **tracks) -> None:
+        self.tried: list[str] = []
+        poses = {name: at(2).copy() for name in ("aligned", "predicted", "confirmed")}
+
+        def align(tracker, frame, last, chosen, T_cw):
+            return poses["aligned" if chosen.sum() == 240 else "confirmed"]
+
+        def track(pyramid, T_cw, *_):
+            (name,) = (name for name, T in poses.items() if T is T_cw)
+            self.tried.append(name)
+            return tracks[name]
+
+        monkeypatch.setattr(Tracker, "_align", align)
+        monkeypatch.setattr("vslam.frontend.tracker.track_patches", track)
+        drive, frame = Drive.of_two_frames(), POINTS.frame(2, 0.2, at(2))
+        frame.pyramid = frame.source = object()
+        local = POINTS.landmarks()._replace(confirmed=np.arange(240) < n_confirmed)
+        view = replace(
+            POINTS.view(), local_landmarks=local, patches=NO_PATCHES._replace(ids=np.arange(1))
+        )
+        found = drive.tracker.track_patches(frame, poses["predicted"], view, drive.frames)
+        self.chosen = next((name for name, one in tracks.items() if one is found), None)
+        self.found = found
+
+
+def near(**options) -> PatchTrack:
+    return patches(T_cw=at(2), **options)
+
+
+def leap(metres: float = 0.11, **options) -> PatchTrack:
+    """Return a pose that is far from the prediction. In 0.1 s, 0.1 m are plausible."""
+    return patches(T_cw=ahead(metres) @ at(2), **options)
+
+
+def test_an_aligned_pose_that_is_supported_is_the_only_one_that_is_tried(monkeypatch):
+    found = Hypotheses(monkeypatch, aligned=near(expected=100, trusted=50))
+    assert (found.chosen, found.tried) == ("aligned", ["aligned"])
+
+
+@pytest.mark.parametrize("aligned", [
+    near(n=400, expected=100, trusted=49),
+    leap(n=400, expected=100, trusted=99),
+    near(n=80, share=0.85),
+], ids=["few trusted", "implausible", "small share"])  # fmt: skip
+def test_the_prediction_is_tried_if_the_aligned_pose_is_doubtful(monkeypatch, aligned):
+    predicted = near(n=200, expected=100, trusted=90)
+    found = Hypotheses(monkeypatch, aligned=aligned, predicted=predicted)
+    assert (found.chosen, found.tried) == ("predicted", ["aligned", "predicted"])
+
+
+@pytest.mark.parametrize(("trusted", "chosen"), [(51, "predicted"), (50, "aligned")])
+def test_an_implausible_acceleration_needs_twice_the_support(monkeypatch, trusted, chosen):
+    found = Hypotheses(
+        monkeypatch,
+        aligned=leap(expected=100, trusted=100),
+        predicted=near(expected=100, trusted=trusted),
+    )
+    assert found.chosen == chosen
+
+
+@pytest.mark.parametrize(("n_confirmed", "tried"), [(30, True), (29, False)])
+def test_confirmed_landmarks_are_aligned_if_neither_pose_is_supported(
+    monkeypatch, n_confirmed, tried
+):
+    few = {"expected": 100, "trusted": 40}
+    found = Hypotheses(
+        monkeypatch,
+        n_confirmed,
+        aligned=near(n=400, **few),
+        predicted=near(n=300, **few),
+        confirmed=near(expected=100, trusted=60),
+    )
+    assert (found.chosen == "confirmed") == tried
+    assert ("confirmed" in found.tried) == tried
+
+
+@pytest.mark.parametrize(("metres", "believed"), [(0.09, True), (0.11, False)])
+def test_an_implausible_pose_without_support_is_not_believed(monkeypatch, metres, believed):
+    track = leap(metres, expected=100, trusted=49)
+    found = Hypotheses(monkeypatch, aligned=track, predicted=track, confirmed=track)
+    assert (found.chosen is not None) == believed
+    assert (found.found is NO_PATCHES_FOUND) != believed
+
+
+# -- standstill -----------------------------------------------------------------------------------
+
+STATIC, MOVING = slice(0, 192), slice(192, 240)  # the object moves by a pixel in the last frame
+
+
+def frame_by_patches(k: int, moved: slice = NOTHING, pixels: float = 0.0) -> Frame:
+    """Return frame k of a camera at rest, in which some points have moved to the right."""
+    frame = POINTS.tracked_frame(k, 0.1 * k, np.eye(4))
+    frame.features.xy[moved, 0] += pixels
+    frame.source = object()
+    return frame
+
+
+def standing(n: int = 240, moved: slice = MOVING, pixels: float = 1.0) -> Drive:
+    """Make a drive of two frames at rest that tracked n points."""
+    drive = Drive()
+    for k in range(2):
+        frame = frame_by_patches(k, *((moved, pixels) if k else ()))
+        frame.landmark[n:], frame.xyz[n:] = -1, np.nan
+        if k:
+            drive.tracker.accept(frame, Found(TrackingState.OK), drive.frames, 1)
+        else:
+            drive.tracker.start_from(frame)
+        drive.frames.append(frame.timestamp, frame.T_cw, tracked=True)
+    return drive
+
+
+@pytest.mark.parametrize(("drive", "stands"), [
+    (standing(), True),
+    (standing(moved=slice(0, 49)), False),  # 79 per cent did not move
+    (standing(moved=ALL, pixels=0.39), True),
+    (standing(moved=ALL, pixels=0.41), False),
+    (standing(40, NOTHING), True),
+    (standing(39, NOTHING), False),
+    (Drive.of_two_frames(), False),
+])  # fmt: skip
+def test_a_camera_stands_still_if_landmarks_do_not_move_in_the_image(drive, stands):
+    assert drive.tracker.stands_still == stands
+
+
+@pytest.mark.parametrize("why", ["features", "lost", "weak"])
+def test_only_two_consecutive_frames_that_were_tracked_by_patches_show_a_standstill(why):
+    drive = Drive()
+    drive.tracker.start_from(frame_by_patches(0))
+    drive.frames.append(0.0, np.eye(4), tracked=True)
+    frame, state = frame_by_patches(1), TrackingState.OK
+    if why == "features":
+        frame.source = None
+    if why == "lost":
+        drive.tracker.lose()
+    if why == "weak":
+        state = TrackingState.WEAK
+    drive.tracker.accept(frame, Found(state), drive.frames, 1)
+    assert not drive.tracker.stands_still
+
+
+@pytest.mark.parametrize(("stands_still", "speed"), [(True, 0.0), (False, 0.4)])
+def test_a_standing_camera_has_no_speed(stands_still, speed):
+    drive = standing()
+    frame = frame_by_patches(2, ALL, 5.0)
+    frame.T_cw = ahead(0.04)
+    found = Found(TrackingState.OK, stands_still=stands_still)
+    drive.tracker.accept(frame, found, drive.frames, 1)
+    assert np.linalg.norm(drive.tracker.twist) == pytest.approx(speed)
+    assert drive.tracker.stands_still == stands_still
+
+
+def unconfirmed(n_keyframes: int = 1) -> MapView:
+    """Return a view of a map with a single keyframe, so that no landmark is confirmed."""
+    nothing = POINTS.landmarks()._replace(confirmed=np.zeros(240, np.bool_))
+    return replace(
+        POINTS.view(), n_keyframes=n_keyframes, local_landmarks=nothing, reference_landmarks=nothing
+    )
+
+
+@pytest.mark.parametrize(("n_keyframes", "turn"), [(1, 0.0), (2, 4.0)])
+def test_what_a_standing_camera_saw_at_rest_is_trusted_until_there_is_a_new_keyframe(
+    n_keyframes, turn
+):
+    """The object has 48 landmarks, and 30 landmarks are at rest."""
+    drive = standing()
+    frame = see_object(slice(0, 30), MOVING, np.eye(4), ahead(0.0, 4.0 / CAMERA.fx))
+    found = drive.tracker.track(frame, np.eye(4), unconfirmed(n_keyframes), drive.frames)
+    assert found.state == TrackingState.OK
+    np.testing.assert_allclose(frame.T_cw, ahead(0.0, turn / CAMERA.fx), atol=1e-4)
+    assert drive.tracker.stands_still == (n_keyframes == 1)
+
+
+@pytest.mark.parametrize(("n_static", "state"), [(30, TrackingState.OK), (29, TrackingState.LOST)])
+def test_features_of_a_moving_object_do_not_take_a_standing_camera_along(n_static, state):
+    drive = standing()
+    frame = see_object(slice(0, n_static), MOVING, np.eye(4), ahead(0.0, 4.0 / CAMERA.fx))
+    assert drive.tracker.track(frame, np.eye(4), unconfirmed(), drive.frames).state == state
+
+
+def test_a_standstill_is_part_of_the_state():
+    drive, moves = standing(), Drive.of_two_frames()
+    other = restored(drive.tracker)
+    assert other.stands_still
+    for field in fields(drive.tracker.state()):
+        mine, theirs = (getattr(one.state(), field.name) for one in (other, drive.tracker))
+        np.testing.assert_equal(mine, theirs, field.name)
+    np.testing.assert_array_equal(other.state().still_ids, np.arange(192))
+    other.restore(moves.tracker.state(), POINTS.xyz)
+    assert not other.stands_still
 
 
 # -- doubt ----------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from vslam.map_kernels import (
     resolve,
     unlink,
 )
-from vslam.map_view import local_map
+from vslam.map_view import NO_LANDMARKS, local_map
 
 SCALES = 1.2 ** np.arange(8)
 
@@ -333,6 +333,18 @@ def test_local_map_holds_the_landmarks_around_a_keyframe_and_is_a_copy():
     map_.arrays.landmark_descriptor[:] = 0
     assert np.isfinite(three.xyz).all()
     assert three.descriptor.any()
+
+
+def test_a_landmark_that_two_keyframes_observe_is_confirmed():
+    map_ = random_map(4, 600)
+    local = local_map(map_, int(map_.living_keyframes()[-2]), 3)
+    seen = [seen_landmarks(map_, k) for k in map_.living_keyframes().tolist()]
+    twice = np.array([sum(i in one for one in seen) >= 2 for i in local.ids.tolist()])
+    np.testing.assert_array_equal(local.confirmed, twice)
+    assert 0 < np.count_nonzero(twice) < len(twice)
+    ids = np.array([-1, local.ids[~twice][0], local.ids[twice][0], local.ids[-1] + 1], np.int32)
+    assert local.confirms(ids).tolist() == [False, False, True, False]
+    assert NO_LANDMARKS.confirms(ids).tolist() == [False] * 4
 
 
 def test_collected_landmarks_are_those_of_any_of_the_keyframes():

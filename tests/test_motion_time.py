@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vslam.config import Config
+from vslam.evaluation.trajectories import evaluate_trajectory
+from vslam.features import TrackingState
 from vslam.frontend.motion_time import RECENT, motion_seconds
+from vslam.slam import Slam
+from vslam.trajectory import Trajectory
 
 
 def times(milliseconds) -> np.ndarray:
@@ -61,3 +66,30 @@ def test_a_quarter_of_irregular_steps_shows_that_frames_were_stamped_on_arrival(
     steps[-1] = 110.0
     expected = float(np.mean(steps)) if mean else 110.0
     assert motion_seconds(times(steps)) == pytest.approx(expected / 1000.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(("sensor", "every"), [("stereo", 1), ("mono", 2)])
+def test_stamps_of_arrival_make_tracking_hardly_worse(corridor, sensor, every):
+    """The poses are those that are known when a frame has been tracked. Patches are found only near
+    their predicted positions."""
+    camera = corridor.camera if sensor == "stereo" else corridor.camera.left_camera()
+    config = Config.model_validate({"tracking": {"method": "patches"}})
+    chosen = np.arange(0, len(corridor), every)
+    even = 100.0 + 0.035 * np.arange(len(chosen))
+    arrival = times(np.tile([58, 58, 23, 1], 10))[: len(chosen)]
+    errors, by_patches = [], []
+    for stamps in (even, arrival):
+        slam = Slam(camera, config, "none", threads=1)
+        results = [
+            slam.step(corridor.left[k], corridor.right[k] if sensor == "stereo" else None, t)
+            for k, t in zip(chosen, stamps, strict=True)
+        ]
+        tracked = np.array([r.index for r in results if r.state == TrackingState.OK])
+        T_wc = np.array([results[k].T_wc for k in tracked])
+        found = Trajectory(stamps[tracked], T_wc)
+        truth = Trajectory(found.timestamps, corridor.T_wc[chosen][tracked])
+        alignment = "se3" if sensor == "stereo" else "sim3"
+        errors.append(evaluate_trajectory(found, truth, alignment).ate_rmse_m)
+        by_patches.append([k for k in tracked if results[k].n_features == 0])
+    assert errors[1] <= 1.5 * errors[0]
+    assert by_patches[1] == by_patches[0]

@@ -126,6 +126,22 @@ def test_the_speed_is_per_second_so_that_dropped_frames_do_not_disturb_it(k):
     np.testing.assert_allclose(drive.predict(k), at(k), atol=1e-9)
 
 
+def test_frames_that_were_stamped_on_arrival_are_taken_as_equally_spaced():
+    """The frames arrive after 58, 58, 23 and 1 ms, although the camera moves evenly."""
+    drive = Drive()
+    stamps = np.cumsum([0, *[58, 58, 23, 1] * 3]) / 1000.0
+    for k, stamp in enumerate(stamps[:-1]):
+        if k > 8:
+            predicted = drive.tracker.predict(stamp, drive.frames, POINTS.view())
+            np.testing.assert_allclose(predicted, at(k), atol=0.1)
+        frame = POINTS.tracked_frame(k, stamp, at(k), FEW)
+        if k:
+            drive.tracker.accept(frame, Found(TrackingState.OK), drive.frames, 1)
+        else:
+            drive.tracker.start_from(frame)
+        drive.frames.append(stamp, frame.T_cw, tracked=True)
+
+
 def test_the_camera_moves_on_while_it_is_lost():
     drive = Drive.of_two_frames()
     drive.lose(2)

@@ -160,7 +160,9 @@ def assert_stands(slam: Slam, results: list[TrackResult], vehicle: Vehicle) -> N
     assert_lost_where_covered(results, vehicle)
 
 
-@pytest.mark.parametrize(("speed", "frames"), [(3, 35), (12, 96), (40, 38)])
+@pytest.mark.parametrize(
+    ("speed", "frames"), [(3, 35), pytest.param(12, 96, marks=pytest.mark.slow), (40, 38)]
+)
 @pytest.mark.parametrize("height", [1 / 3, 2 / 3, 1.0])
 def test_a_vehicle_that_passes_a_standing_camera_does_not_move_it(street, height, speed, frames):
     vehicle = Vehicle(height, speed)

@@ -3,7 +3,7 @@
 For each scene, the largest error of the pose at the time of tracking is reported, relative to the
 first frame and without alignment.
 
-Usage: python tools/experiments/recordings/moving_objects.py OUT.csv [--scenes REGEX] [--seed N]
+    python tools/experiments/recordings/moving_objects.py --out families.csv
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from __future__ import annotations
 import argparse
 import csv
 import re
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,6 +133,21 @@ def scenes(camera: Camera) -> dict[str, Scene]:
     return found
 
 
+@dataclass(frozen=True)
+class Drive:
+    """The ``(N, H, W)`` left and right images of a scene, and the ``(N, 4, 4)`` true poses."""
+
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+    T_wc: NDArray[np.float64]
+
+    def errors_cm(self, T_wc: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the ``(N,)`` errors of the positions relative to the first frame."""
+        found, true = (inverse(T[0]) @ T for T in (T_wc, self.T_wc))
+        errors: NDArray[np.float64] = np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1)
+        return 100.0 * errors
+
+
 class Stage:
     """Renders the scenes in a street of a rendered town."""
 
@@ -184,76 +201,68 @@ class Stage:
                 yield left, right, T_wc
 
 
-def cached(stage: Stage, name: str, scene: Scene, folder: Path):
-    path = folder / f"{name}_{stage.variation.seed}.npz"
+def rendered(stage: Stage, name: str, scene: Scene, cache: Path) -> Drive:
+    """Render a scene, or read it from the folder ``cache``."""
+    path = cache / f"{name}_{stage.variation.seed}.npz"
     if not path.exists():
         left, right, poses = zip(*stage.frames(scene), strict=True)
         np.savez(path, left=np.array(left), right=np.array(right), T=np.array(poses))
-    data = np.load(path)
-    return data["left"], data["right"], data["T"]
+    with np.load(path) as data:
+        return Drive(data["left"], data["right"], data["T"])
 
 
-def measure(camera: Camera, left, right, T_true, config=None) -> dict:
-    slam = Slam(camera, config, detector="none")
-    results = [
-        slam.step(a, b, k * STEP_S) for k, (a, b) in enumerate(zip(left, right, strict=True))
-    ]
+def measure(camera: Camera, drive: Drive) -> dict[str, float]:
+    """Run SLAM on a scene."""
+    slam = Slam(camera, detector="none")
+    pairs = zip(drive.left, drive.right, strict=True)
+    results = [slam.step(*pair, k * STEP_S) for k, pair in enumerate(pairs)]
     slam.finish()
-    causal = np.array([r.T_wc for r in results])
-    final = slam.trajectory().T_wc
-    first = inverse(T_true[0])
+    causal = drive.errors_cm(np.array([result.T_wc for result in results]))
+    final = drive.errors_cm(slam.trajectory().T_wc)
+    return {
+        "largest_cm": round(float(causal.max()), 2),
+        "final_cm": round(float(final.max()), 2),
+        "lost": sum(result.state == TrackingState.LOST for result in results),
+        "keyframes": sum(result.is_keyframe for result in results),
+    }
 
-    def error(T):
-        return np.array(
-            [
-                np.linalg.norm((inverse(T[0]) @ p)[:3, 3] - (first @ q)[:3, 3])
-                for p, q in zip(T, T_true, strict=True)
-            ]
-        )
 
-    e, f = error(causal), error(final)
-    return dict(
-        max_cm=round(100 * e.max(), 2),
-        end_cm=round(100 * e[-1], 2),
-        final_cm=round(100 * f.max(), 2),
-        lost=sum(r.state == TrackingState.LOST for r in results),
-        weak=sum(r.state == TrackingState.WEAK for r in results),
-        keyframes=sum(r.is_keyframe for r in results),
-        orb=sum(r.n_features > 0 for r in results),
-    )
+def by_family(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the worst numbers of each family of scenes."""
+    families: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        families.setdefault(re.split(r"_(?!start)", row["scene"])[0], []).append(row)
+    worst = ("largest_cm", "final_cm", "lost", "keyframes")
+    return [
+        {"family": family, "scenes": len(ours)}
+        | {"within_2_cm": sum(row["largest_cm"] <= 2.0 for row in ours)}
+        | {name: max(row[name] for row in ours) for name in worst}
+        for family, ours in families.items()
+    ]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--scenes", default=".")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cache", type=Path, default=Path("/tmp/moving"))
-    parser.add_argument("--orb", action="store_true")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True, help="CSV file of the families")
+    parser.add_argument("--scenes", default=".", help="regular expression of the scenes")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1], help="towns")
+    parser.add_argument("--cache", type=Path, help="folder that keeps the rendered scenes")
     args = parser.parse_args()
-    args.cache.mkdir(exist_ok=True)
-    stage = Stage(args.seed)
-    rows = []
-    for name, scene in scenes(stage.route.camera).items():
-        if not re.search(args.scenes, name):
-            continue
-        left, right, T = cached(stage, name, scene, args.cache)
-        row = {
-            "scene": name,
-            **measure(
-                stage.route.camera,
-                left,
-                right,
-                T,
-                {"tracking": {"method": "orb"}} if args.orb else None,
-            ),
-        }
-        rows.append(row)
-        print(*(f"{k}={v}" if k != "scene" else f"{v:24}" for k, v in row.items()), flush=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        cache = args.cache or Path(temporary)
+        cache.mkdir(parents=True, exist_ok=True)
+        rows = []
+        for stage in map(Stage, args.seeds):
+            for name, scene in scenes(stage.route.camera).items():
+                if re.search(args.scenes, name):
+                    drive = rendered(stage, name, scene, cache)
+                    rows.append({"scene": name} | measure(stage.route.camera, drive))
+                    print(stage.variation.seed, *rows[-1].values(), sep="\t", flush=True)
     with args.out.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        families = by_family(rows)
+        writer = csv.DictWriter(file, list(families[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(families)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from vslam.map_view import MapView
 _MARGIN = PATCH_RADIUS + 2  # least distance of a patch centre from the border of its level, pixels
 
 # In ordinary drives, at least this share of the expected trusted landmarks agrees with the pose.
-SUPPORT_SHARE = 0.5
+SUPPORT_SHARE = 0.4
 
 
 class PatchTrack(NamedTuple):

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam import METHOD_VERSION
 from vslam.camera import Camera, Image
 from vslam.datasets.synthetic.passes import Passes
 from vslam.datasets.synthetic.render import Renderer, sensor_image
@@ -234,7 +235,7 @@ def by_family(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         families.setdefault(re.split(r"_(?!start)", row["scene"])[0], []).append(row)
     worst = ("largest_cm", "final_cm", "lost", "keyframes")
     return [
-        {"family": family, "scenes": len(ours)}
+        {"family": family, "method": METHOD_VERSION, "scenes": len(ours)}
         | {"within_2_cm": sum(row["largest_cm"] <= 2.0 for row in ours)}
         | {name: max(row[name] for row in ours) for name in worst}
         for family, ours in families.items()

@@ -454,7 +454,8 @@ def _depth_sources(desk: Path, corridor) -> None:
 
 
 def _pair_sources(desk: Path, corridor) -> None:
-    """Write images into ``FOLDER``, into two folders, and with depth; a video; and a bag."""
+    """Write images into ``FOLDER``, into two folders, and with depth; a video; a bag; and a drive
+    of KITTI raw."""
     _videos(desk, corridor)
     names = [f"{10**18 + 10**8 * k}.png" for k in range(N)]
     sides = {"LEFT": corridor.left[:N], "RIGHT": corridor.right[:N], "RGB": corridor.left[:N]}
@@ -467,6 +468,16 @@ def _pair_sources(desk: Path, corridor) -> None:
     of_bag = {"/cam0/image_raw": sides["LEFT"], "/cam1/image_raw": sides["RIGHT"]}
     stamps = [10**8 * (k + 1) for k in range(N)]
     write_bag(desk / "drive.bag", "ros1", of_bag, stamps, camera=corridor.camera)
+    drive = desk / "2011_09_26" / "2011_09_26_drive_0005_sync"
+    rows, c = "", corridor.camera
+    for k, side in enumerate(("LEFT", "RIGHT")):
+        names = [f"{n:010d}.png" for n in range(N)]
+        write_images(drive, {f"image_0{k}/data": sides[side]}, names)
+        times = "".join(f"2011-09-26 13:02:25.{n}00000000\n" for n in range(N))
+        (drive / f"image_0{k}" / "timestamps.txt").write_text(times)
+        rows += f"S_0{k}: {c.width} {c.height}\nS_rect_0{k}: {c.width} {c.height}\n"
+        rows += f"P_rect_0{k}: {c.fx} 0 {c.cx} {-c.bf * k} 0 {c.fy} {c.cy} 0 0 0 1 0\n"
+    (drive.parent / "calib_cam_to_cam.txt").write_text(rows)
 
 
 def _earlier_run(desk: Path, corridor) -> None:

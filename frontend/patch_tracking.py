@@ -62,6 +62,12 @@ class PatchTrack(NamedTuple):
         return self.n_trusted if self.n_expected >= MIN_TRUSTED else len(self.ids)
 
     @property
+    def trusted_share(self) -> float | None:
+        """Share of the expected trusted landmarks among the inliers; None if few are expected."""
+        few = self.n_expected < MIN_TRUSTED
+        return None if few else self.n_trusted / self.n_expected
+
+    @property
     def lacks_support(self) -> bool:
         """Whether so few of the trusted landmarks agree that the pose may be that of a moving
         object."""

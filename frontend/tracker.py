@@ -176,6 +176,7 @@ class Tracker:
 
         Args:
             T_cw: ``(4, 4)`` predicted pose (world to camera).
+            frames: poses of all earlier frames, including lost frames.
         """
         view = self._trusting(view)
         last, config = self.last, self._config.tracking
@@ -258,7 +259,7 @@ class Tracker:
             track.n_matches,
             len(track.ids),
             track.visible,
-            support=track.n_trusted / max(1, track.n_expected),
+            support=track.trusted_share,
             stands_still=track.stands_still,
         )
 

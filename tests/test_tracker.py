@@ -389,15 +389,16 @@ def patches(
 
 @pytest.mark.parametrize(("expected", "trusted", "support", "lacks"), [
     (29, 0, 300, False),  # hardly any trusted landmark is expected
-    (30, 15, 15, False),
-    (30, 14, 14, True),
-    (100, 50, 50, False),
-    (100, 49, 49, True),
+    (30, 12, 12, False),
+    (30, 11, 11, True),
+    (100, 40, 40, False),
+    (100, 39, 39, True),
 ])  # fmt: skip
 def test_trusted_landmarks_support_a_pose_if_enough_are_expected(expected, trusted, support, lacks):
     track = patches(expected=expected, trusted=trusted)
     assert track.support == support
     assert track.lacks_support == lacks
+    assert track.trusted_share == (trusted / expected if expected >= 30 else None)
 
 
 @pytest.mark.parametrize(("track", "state"), [
@@ -460,12 +461,12 @@ def leap(metres: float = 0.11, **options) -> PatchTrack:
 
 
 def test_an_aligned_pose_that_is_supported_is_the_only_one_that_is_tried(monkeypatch):
-    found = Hypotheses(monkeypatch, aligned=near(expected=100, trusted=50))
+    found = Hypotheses(monkeypatch, aligned=near(expected=100, trusted=40))
     assert (found.chosen, found.tried) == ("aligned", ["aligned"])
 
 
 @pytest.mark.parametrize("aligned", [
-    near(n=400, expected=100, trusted=49),
+    near(n=400, expected=100, trusted=39),
     leap(n=400, expected=100, trusted=99),
     near(n=80, share=0.85),
 ], ids=["few trusted", "implausible", "small share"])  # fmt: skip
@@ -489,7 +490,7 @@ def test_an_implausible_acceleration_needs_twice_the_support(monkeypatch, truste
 def test_confirmed_landmarks_are_aligned_if_neither_pose_is_supported(
     monkeypatch, n_confirmed, tried
 ):
-    few = {"expected": 100, "trusted": 40}
+    few = {"expected": 100, "trusted": 39}
     found = Hypotheses(
         monkeypatch,
         n_confirmed,
@@ -503,7 +504,7 @@ def test_confirmed_landmarks_are_aligned_if_neither_pose_is_supported(
 
 @pytest.mark.parametrize(("metres", "believed"), [(0.09, True), (0.11, False)])
 def test_an_implausible_pose_without_support_is_not_believed(monkeypatch, metres, believed):
-    track = leap(metres, expected=100, trusted=49)
+    track = leap(metres, expected=100, trusted=39)
     found = Hypotheses(monkeypatch, aligned=track, predicted=track, confirmed=track)
     assert (found.chosen is not None) == believed
     assert (found.found is NO_PATCHES_FOUND) != believed

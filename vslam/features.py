@@ -308,7 +308,8 @@ class TrackResult:
             later frames have the smaller index.
         support: share of the landmarks at rest that should be visible and that agree with the pose.
             It is small if a large part of the image moves against the rest, or is covered. None for
-            a frame that was not tracked by patches.
+            a frame that was not tracked by patches, and if hardly any landmark is known to be at
+            rest, as at the start of a map.
         stands_still: whether the camera stands still.
     """
 

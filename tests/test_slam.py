@@ -431,12 +431,17 @@ def test_a_stationary_camera_stays_and_does_not_grow_the_map(corridor):
     assert slam.map.n_keyframes <= 4
 
 
-def test_a_stationary_camera_keeps_few_of_many_keyframes(corridor, check_map):
-    slam = Slam(corridor.camera, EAGER, "none", threads=1)
+@pytest.mark.parametrize(("method", "inserted"), [("orb", 15), ("patches", 2)])
+def test_a_stationary_camera_keeps_few_keyframes(corridor, check_map, method, inserted):
+    """Without patches, a standing camera is not recognised, and its keyframes are culled later."""
+    eager = EAGER.model_copy(
+        update={"tracking": EAGER.tracking.model_copy(update={"method": method})}
+    )
+    slam = Slam(corridor.camera, eager, "none", threads=1)
     for k in range(15):
         slam.step(corridor.left[0], corridor.right[0], 0.1 * k)
     slam.finish()
-    assert slam.map.n_keyframes == 15
+    assert slam.map.n_keyframes == inserted
     assert len(slam.map.living_keyframes()) <= 6
     assert np.abs(slam.trajectory().T_wc - np.eye(4)).max() < 0.01
     check_map(slam.map)

@@ -179,6 +179,16 @@ RULES = {
     "docs/research/scale.md": Rules(
         not_run=(("python tools/experiments/scale/growth.py", "test_scale.py runs it"),)
     ),
+    "docs/research/recordings.md": Rules(
+        not_run=(
+            ("python tools/experiments/recordings", HOURS),
+            (
+                "vslam run",
+                "the inputs are excerpts of data sets, whose licences forbid passing them on",
+            ),
+            ("vslam eval", "as above"),
+        )
+    ),
     "docs/research/uncertainty.md": Rules(
         not_run=(
             ("vslam synth", "test_synthetic.py renders drives"),

@@ -210,10 +210,11 @@ class Tracker:
         if (doubtful or not is_plausible(track)) and T_aligned is not T_cw:
             # Image alignment may have followed moving objects.
             track = max(track, track_from(T_cw), key=support)
-        confirmed = view.local_landmarks.confirms(last.landmark)
-        if track.lacks_support and np.count_nonzero(confirmed) >= MIN_TRUSTED:
-            T_aligned = self._align(frame, last, confirmed, T_cw)
-            track = max(track, track_from(T_aligned), key=support)
+        if track.lacks_support:
+            confirmed = view.local_landmarks.confirms(last.landmark)
+            if np.count_nonzero(confirmed) >= MIN_TRUSTED:
+                T_aligned = self._align(frame, last, confirmed, T_cw)
+                track = max(track, track_from(T_aligned), key=support)
         if track.lacks_support and not is_plausible(track):
             return NO_PATCHES_FOUND
         return track

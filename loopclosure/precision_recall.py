@@ -43,7 +43,12 @@ def precision_recall(same: NDArray, score: NDArray) -> PrecisionRecall:
         InputError: no pair shows the same place, the lengths differ, or a score is NaN.
     """
     same, score = np.asarray(same, bool), np.asarray(score, np.float64)
-    if same.shape != score.shape or same.ndim != 1:
+    _require_scores_of(same, score, 1)
+    return curve_of(same, score, int(same.sum()))
+
+
+def _require_scores_of(same: NDArray, score: NDArray, dimensions: int) -> None:
+    if same.shape != score.shape or same.ndim != dimensions:
         raise InputError(
             f"precision-recall: the labels have the shape {same.shape}, but the scores have the "
             f"shape {score.shape}."
@@ -52,7 +57,44 @@ def precision_recall(same: NDArray, score: NDArray) -> PrecisionRecall:
         raise InputError("precision-recall: empty ground truth; no pair shows the same place.")
     if np.isnan(score).any():
         raise InputError("precision-recall: a score is NaN; check the weights of the detector.")
-    return curve_of(same, score, int(same.sum()))
+
+
+def top_k_precision_recall(
+    same: NDArray, score: NDArray, k: int, known: NDArray | None = None
+) -> PrecisionRecall:
+    """Compute the precision-recall curve of the K most similar gallery images of each query.
+
+    These images are the candidates of the query. Of equally similar images, those with the lower
+    index are chosen. At each threshold, the candidates of all queries whose score is at least the
+    threshold are accepted.
+
+    - Precision is the share of the accepted candidates that show the same place as their query. If
+      the place of a query is not in the gallery, every accepted candidate of this query is wrong.
+    - Recall is the number of accepted candidates that show the same place, divided by the number of
+      true matches that could be found. For a query with m true matches, that is min(m, K). A query
+      without a true match adds nothing to this number.
+
+    A detector that ranks every true match before every other pair has an average precision of 1 for
+    each K. If K is at least G, the curve is that of `precision_recall` over all pairs.
+
+    Args:
+        same: ``(Q, G)`` bool, True where a query and a gallery image show the same place.
+        score: ``(Q, G)`` similarity of each query and each gallery image.
+        k: largest number of candidates of a query, at least 1.
+        known: ``(Q, G)`` bool, False for pairs that are left out because their ground truth is
+            unknown. None stands for True everywhere.
+
+    Raises:
+        InputError: no pair shows the same place, the shapes differ, or a score is NaN.
+    """
+    same, score = np.asarray(same, bool), np.asarray(score, np.float64)
+    known = np.ones(same.shape, bool) if known is None else np.asarray(known, bool)
+    same = same & known
+    _require_scores_of(same, score, 2)
+    # Known pairs come first, in descending order of their scores.
+    order = np.lexsort((-score, ~known), axis=1)[:, :k]
+    right, ranked, kept = (np.take_along_axis(one, order, axis=1) for one in (same, score, known))
+    return curve_of(right[kept], ranked[kept], int(np.minimum(same.sum(1), k).sum()))
 
 
 def curve_of(right: NDArray[np.bool_], score: NDArray[np.float64], total: int) -> PrecisionRecall:

@@ -33,6 +33,8 @@ def score(data: str, detector: str, ap: float, sequence: float | None) -> Score:
         accuracy={"0.5": None if detector == "bow" else 0.875, "0.9": None}, first_right=0.8125,
         accepted=None if detector == "bow" else (0.9, 0.1), sequence_right=sequence,
         verified=verified, curve=Curve(precision=[0.5, 1.0], recall=[1.0, 0.0]),
+        top_average_precision=(0.9, 0.8, 0.4),
+        top_curve=Curve(precision=[0.5, 1.0], recall=[0.9, 0.0]),
     )  # fmt: skip
 
 
@@ -82,6 +84,7 @@ def rows(path: Path) -> list[dict[str, str]]:
         ("sequences", "kitti00 none 0.812 0.875 0.812 1.000"),
         ("verification", "town none capsule 8 0.812 0.625 3 0.625 3 0.625 3"),
         ("scores", "town none capsule 0.850 0.250 0.750 0.900 0.100 0.812 0.625 3"),
+        ("top_k", "town none capsule 0.850 0.900 0.400 0.700 0.812"),
         ("online", "kitti00 bow 20 s orb 10 4 3 1 0 0.500 0.750 0.800 0.900"),
         ("cost", "bow 0.19 0.4 0.12 0.10 467"),
     ],
@@ -100,5 +103,6 @@ def test_columns_have_the_names_that_pages_use(written, name):
 
 def test_curves_are_drawn_for_each_set(written):
     assert [path.name for path in sorted(written.glob("*.png"))] == [
-        "online.png", "precision_recall_0.png", "precision_recall_1.png"
+        "online.png", "precision_recall_0.png", "precision_recall_1.png",
+        "precision_recall_top_0.png", "precision_recall_top_1.png",
     ]  # fmt: skip

@@ -27,6 +27,7 @@ from vslam.lab.loopbench.cost import cost
 from vslam.lab.loopbench.detectors import BowScorer, DetectorSet, LocalDescriptorCache, describe
 from vslam.lab.loopbench.measure import (
     LENGTH,
+    TOP,
     epipolar_inliers,
     log_odds,
     measure,
@@ -211,6 +212,11 @@ def test_figures_of_detectors_that_know_and_that_err(vocabulary):
     assert sage.accuracy == {"0.5": 1.0, "0.9": 1.0}
     assert sage.accepted == (1.0, 1.0)
     assert (sage.queries, sage.first_right) == (6, 1.0)
+    assert sage.top_average_precision == (1.0,) * TOP
+    assert liar.top_average_precision[0] == 0.0
+    # Query 0 has only five images whose relation is known, so that its match is among the top five.
+    assert liar.top_average_precision[-1] == pytest.approx(1 / 6 / 30)
+    assert liar.top_curve.recall[0] == pytest.approx(1 / 6, abs=1e-5)
     names = ("orb", "learned", "both")
     assert sage.verified == {name: Verified(right=1.0, wrong=0) for name in names}
     assert liar.accuracy == {"0.5": 0.0, "0.9": 0.0}
@@ -302,7 +308,8 @@ def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):
         assert "none: AP of liar minus that of bow is -0." in shown
         assert "worse on walls" in shown
         assert "1.000" in shown
-    assert page.count("<svg") == 1
+    assert "Average precision over the top K candidates" in shown
+    assert page.count("<svg") == 2  # over all pairs, and over the top candidates
     assert "&lt;b&gt; machine" in page
     assert not re.search(r"(src|href)=\"http", page)
 

@@ -16,6 +16,7 @@ from vslam.loopclosure.precision_recall import (
     precision_recall,
     recall_at_full_precision,
     summary,
+    top_k_precision_recall,
 )
 
 # 5 true pairs of 8; two scores tie.
@@ -61,6 +62,61 @@ def test_a_wrong_pair_on_top_leaves_no_recall_at_full_precision():
     assert recall_at_full_precision(curve) == 0.0
 
 
+def counted_by_hand(same, score, known, k, threshold):
+    """Return the numbers of accepted, right and findable candidates, pair by pair."""
+    accepted = right = findable = 0
+    for q in range(len(score)):
+        images = [g for g in range(score.shape[1]) if known[q, g]]
+        candidates = sorted(images, key=lambda g: (-score[q, g], g))[:k]
+        findable += min(k, sum(bool(same[q, g]) for g in images))
+        for g in candidates:
+            if score[q, g] >= threshold:
+                accepted += 1
+                right += bool(same[q, g])
+    return accepted, right, findable
+
+
+@pytest.mark.parametrize("k", [1, 2, 5, 40])
+@pytest.mark.parametrize("ties", [False, True])
+def test_curve_over_the_top_candidates_counts_every_query_and_match(k, ties):
+    rng = np.random.default_rng(k)
+    score = rng.integers(0, 7, (12, 9)) / 6 if ties else rng.standard_normal((12, 9))
+    same = rng.random((12, 9)) < np.linspace(0.0, 0.9, 12)[:, None]  # from none to nearly all
+    known = rng.random((12, 9)) < 0.8
+    score[~known] = 9.0  # must not matter
+    known[5] = False  # a query without any candidate
+    assert not same[0].any()
+    assert same[-1].sum() > 5
+    curve = top_k_precision_recall(same, score, k, known)
+    for n, threshold in enumerate(curve.thresholds):
+        accepted, right, findable = counted_by_hand(same, score, known, k, threshold)
+        assert curve.precision[n] == pytest.approx(right / accepted)
+        assert curve.recall[n] == pytest.approx(right / findable)
+    lowest = counted_by_hand(same, score, known, k, -np.inf)
+    assert curve.recall[0] == pytest.approx(lowest[1] / lowest[2])
+    if k >= 9:
+        usual = precision_recall(same[known], score[known])
+        assert np.array_equal(curve.precision, usual.precision)
+        assert np.array_equal(curve.recall, usual.recall)
+
+
+def test_curve_over_the_top_candidates_by_hand():
+    """Query 0 has two true matches, query 1 has one, and the place of query 2 is new."""
+    same = np.array([[1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]], bool)
+    score = np.array([[0.9, 0.6, 0.5, 0.1], [0.2, 0.7, 0.4, 0.3], [0.1, 0.2, 0.3, 0.8]])
+    one = top_k_precision_recall(same, score, 1)
+    # Ranked: 0.9 right, 0.8 of the new place, 0.7 of query 1. Two matches could be found.
+    assert one.precision.tolist() == pytest.approx([1 / 3, 1 / 2, 1, 1])
+    assert one.recall.tolist() == pytest.approx([1 / 2, 1 / 2, 1 / 2, 0])
+    # With two candidates, also 0.6 right, 0.4 right, 0.3 of the new place. Three could be found.
+    two = top_k_precision_recall(same, score, 2)
+    assert average_precision(two) == pytest.approx((1 + 2 / 4 + 3 / 5) / 3)
+    assert two.recall[0] == 1.0
+    # Nothing is lost by a detector that ranks all true matches first.
+    for k in (1, 2, 3):
+        assert average_precision(top_k_precision_recall(same, same + 0.1 * score, k)) == 1.0
+
+
 def test_bad_figures_are_refused():
     with pytest.raises(InputError, match="empty ground truth"):
         precision_recall(np.zeros(3, bool), np.zeros(3))
@@ -68,5 +124,11 @@ def test_bad_figures_are_refused():
         precision_recall(np.ones(2, bool), np.array([0.1, np.nan]))
     with pytest.raises(InputError, match="the labels have the shape"):
         precision_recall(np.ones(2, bool), np.zeros(3))
+    with pytest.raises(InputError, match="empty ground truth"):
+        top_k_precision_recall(np.eye(2), np.zeros((2, 2)), 1, known=1 - np.eye(2))
+    with pytest.raises(InputError, match="NaN"):
+        top_k_precision_recall(np.eye(2), np.full((2, 2), np.nan), 1)
+    with pytest.raises(InputError, match="the labels have the shape"):
+        top_k_precision_recall(np.eye(2), np.zeros((2, 3)), 1)
     with pytest.raises(InputError, match="same place and of different places"):
         balanced_accuracy(np.ones(2, bool), np.zeros(2), 0.5)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from vslam.lab.loopbench.curves import draw_curves
-from vslam.lab.loopbench.report import MEAN
+from vslam.lab.loopbench.report import MEAN, top_figures
 from vslam.lab.loopbench.schema import Cost, LoopsJson, OnlineScore, Score
 
 Row = dict[str, str]
@@ -47,6 +47,7 @@ def tables(report: LoopsJson) -> dict[str, list[Row]]:
         "sequences": _wide(ordered, _sequence),
         "verification": [_verification(cell) for cell in cells if cell.verified],
         "scores": [_score(cell) for cell in cells],
+        "top_k": [_top(cell) for cell in cells if cell.top_average_precision],
         "online": [_online(score) for score in report.online],
         "cost": [_cost(cost) for cost in report.costs],
     }
@@ -136,6 +137,13 @@ def _score(cell: Score) -> Row:
         "best_right_verified": _share(orb and orb.right),
         "wrong_verified": str(orb.wrong) if orb else "",
     }
+
+
+def _top(cell: Score) -> Row:
+    row = {"images": cell.data, "condition": cell.condition, "detector": cell.detector}
+    row["average_precision"] = _share(cell.figures["average_precision"])
+    row |= {f"{name}_average_precision": _share(x) for name, x in top_figures(cell).items()}
+    return row | {"best_right": _share(cell.first_right)}
 
 
 def _online(score: OnlineScore) -> Row:

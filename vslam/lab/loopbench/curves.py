@@ -32,9 +32,11 @@ Line = tuple[str, Curve | DecisionCurve, str, str, str]
 
 
 def draw_curves(report: LoopsJson) -> list[page.Figure]:
-    """Draw precision-recall curves: one figure for each set of images, and one for all drives.
+    """Draw precision-recall curves: two figures for each set of images, and one for all drives.
 
-    The figure for a set of images has one panel per condition (change of the query images).
+    The first figure for a set of images shows the curves over all pairs, and the second one shows
+    those over the most similar images of each query. There is one panel per condition (change of
+    the query images).
     """
     return draw(_drawings(report))
 
@@ -57,16 +59,21 @@ def _drawings(report: LoopsJson) -> Iterator[Drawing]:
     for number, data in enumerate(_in_order(score.data for score in report.cells)):
         scores = [score for score in report.cells if score.data == data]
         conditions = _in_order(score.condition for score in scores)
-        caption = (
-            f"Precision against recall on {data} without verification, with a panel for each "
-            "condition."
-        )
-        lines = []
+        usual, over_top = [], []
         for score in scores:
             dash, color = divmod(names.index(score.detector), len(_COLORS))
-            look = _COLORS[color], _DASHES[dash % len(_DASHES)]
-            lines.append((score.condition, score.curve, score.detector, *look))
-        yield f"precision_recall_{number}", caption, _panels(data, conditions, lines)
+            look = score.detector, _COLORS[color], _DASHES[dash % len(_DASHES)]
+            usual.append((score.condition, score.curve, *look))
+            if score.top_curve:
+                over_top.append((score.condition, score.top_curve, *look))
+        caption = f"Precision against recall on {data} without verification, "
+        panel = "with a panel for each condition."
+        yield f"precision_recall_{number}", caption + panel, _panels(data, conditions, usual)
+        if over_top:
+            top = max(len(score.top_average_precision) for score in scores)
+            caption += f"over the {top} most similar images of each query, "
+            figure = _panels(data, conditions, over_top)
+            yield f"precision_recall_top_{number}", caption + panel, figure
 
 
 def _panels(title: str, names: list[str], lines: Iterable[Line]) -> Figure:

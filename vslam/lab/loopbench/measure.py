@@ -25,6 +25,7 @@ from vslam.loopclosure.precision_recall import (
     balanced_accuracy,
     precision_recall,
     summary,
+    top_k_precision_recall,
 )
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 
@@ -36,6 +37,7 @@ MIN_CELLS, LEAST_COSINE = 90, 0.5
 MIN_MATCHES = 20
 _EPIPOLAR_PIXELS = 2.0
 _CURVE_POINTS = 200
+TOP = 5  # the largest number of candidates of a query in the curves over the top K candidates
 _RESAMPLES = 200  # bootstrap resamples of the queries
 # Matching of sequences, as in OpenSeqSLAM (Sünderhauf et al., ICRA 2013 workshop).
 LENGTH = 10  # number of queries in a sequence
@@ -92,6 +94,10 @@ def _score(
         for threshold in (0.5, 0.9)
     }
     curve = precision_recall(same, score)
+    top = [
+        top_k_precision_recall(query_set.relation == SAME, scores, k, known)
+        for k in range(1, TOP + 1)
+    ]
     answerable = (query_set.relation == SAME).any(1)
     best, truth = _best_images(scores, query_set.relation)
     sequence_right = None
@@ -121,6 +127,8 @@ def _score(
         sequence_right=sequence_right,
         verified=verified,
         curve=thinned(curve),
+        top_average_precision=tuple(map(average_precision, top)),
+        top_curve=thinned(top[-1]),
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from vslam.errors import counted
 from vslam.lab.loopbench.curves import draw_curves
-from vslam.lab.loopbench.measure import LENGTH, MIN_CELLS, MIN_MATCHES
+from vslam.lab.loopbench.measure import LENGTH, MIN_CELLS, MIN_MATCHES, TOP
 from vslam.lab.loopbench.schema import LoopsJson, OnlineScore, Score
 from vslam.report.page import Bullets, Page, Pairs, Section, Table
 from vslam.report.render import html, markdown, write_files
@@ -22,6 +22,11 @@ _ABOUT_AP = (
     "Average precision (AP) without verification, over all pairs of a query and a gallery image "
     "whose relation is known. The last columns give the AP of a detector minus that of the first "
     "one, with a 95 % bootstrap interval over the queries. A * marks intervals that exclude 0."
+)
+_ABOUT_TOP = (
+    "Average precision over the K most similar gallery images of each query, for the lowest and "
+    "the highest K, and its mean over all K. If the place of a query is not in the gallery, all of "
+    "its K images are wrong. If a query has several true matches, up to K of them must be found."
 )
 _ABOUT_RECALL = "The highest recall without a wrong pair, and the precision at a recall of 70 %."
 _ABOUT_VERIFIED = (
@@ -147,6 +152,17 @@ def _sequence(score: Score) -> str:
     return _listed((score.first_right, score.sequence_right))
 
 
+def _top(score: Score) -> str:
+    return _listed(top_figures(score).values()) or "-"
+
+
+def top_figures(score: Score) -> dict[str, float]:
+    """Return the average precision over the top K candidates, for the lowest and the highest K, and
+    its mean over K; empty for older files."""
+    ap = score.top_average_precision
+    return {"top_1": ap[0], f"top_{len(ap)}": ap[-1], "top_mean": float(np.mean(ap))} if ap else {}
+
+
 def _operating_points(score: Score) -> str:
     names = ("recall_at_100_precision", "precision_at_70_recall")
     return _listed(score.figures[name] for name in names)
@@ -162,6 +178,7 @@ def _listed(values: Iterable[float | None]) -> str:
 
 # Title, text of a cell, and note of each table that has one column for each detector.
 _TABLES: list[tuple[str, Callable[[Score], str], str]] = [
+    (f"Average precision over the top K candidates, K = 1, {TOP}, mean", _top, _ABOUT_TOP),
     ("Recall at 100 % precision, precision at 70 % recall", _operating_points, _ABOUT_RECALL),
     ("Best image right, and also verified by ORB, by learned descriptors, by either", _verified,
      _ABOUT_VERIFIED),

@@ -46,6 +46,10 @@ class Score(Record):
     - ``verified``: results by kind of verification. ``orb`` uses ORB descriptors, and ``learned``
       uses learned local descriptors. With ``both``, an image is accepted if at least one of these
       two accepts it. Empty without verification.
+    - ``top_average_precision``: average precision over the K most similar images of each query, for
+      K = 1, 2, ... `vslam.loopclosure.precision_recall.top_k_precision_recall` defines precision
+      and recall. Empty in older files.
+    - ``top_curve``: precision-recall curve for the largest of these K. None in older files.
     """
 
     data: str
@@ -59,6 +63,8 @@ class Score(Record):
     sequence_right: float | None = None
     verified: dict[str, Verified]
     curve: Curve
+    top_average_precision: tuple[float, ...] = ()
+    top_curve: Curve | None = None
 
 
 class DecisionCurve(Record):

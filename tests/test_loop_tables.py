@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from vslam.lab.loopbench.curves import draw_curves
 from vslam.lab.loopbench.schema import (
     Cost,
     Curve,
@@ -99,6 +100,19 @@ def test_columns_have_the_names_that_pages_use(written, name):
     kept = rows(ROOT / "docs" / "research" / "loops" / f"{name}.csv")
     here = rows(written / f"{name}.csv")
     assert {"condition", *kept[0]} >= here[0].keys() - {"images"}
+
+
+def test_a_legend_names_each_detector_once():
+    cells = [
+        score("town", name, 0.5, None).model_copy(update={"condition": condition})
+        for condition in ("none", "light:1")
+        for name in ("bow", "capsule")
+    ]
+    report = LoopsJson(
+        seed=0, cells=cells, machine="", versions={}, created=datetime(2026, 1, 1, tzinfo=UTC)
+    )
+    for figure in draw_curves(report):
+        assert [figure.svg.count(f">{name}<") for name in ("bow", "capsule")] == [1, 1]
 
 
 def test_curves_are_drawn_for_each_set(written):

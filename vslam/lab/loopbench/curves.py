@@ -90,8 +90,11 @@ def _panels(title: str, names: list[str], lines: Iterable[Line]) -> Figure:
     for name, axes in panels.items():
         axes.set_title(name, fontsize=9, color=INK)
         axes.set(xlim=(0, 1), ylim=(0, 1.02))
+    named: set[str] = set()  # the legend lists the lines of all panels
     for name, curve, label, color, dashes in lines:
-        panels[name].plot(curve.recall, curve.precision, dashes, color=color, label=label)
+        shown = "" if label in named else label
+        panels[name].plot(curve.recall, curve.precision, dashes, color=color, label=shown)
+        named.add(label)
     add_legend(figure, grid[0, 0])
     for axes in grid[-1, : (len(names) - 1) % columns + 1]:
         axes.set_xlabel("recall", fontsize=9.5)

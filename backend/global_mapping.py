@@ -6,7 +6,7 @@ mapping continue (Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017, section III-D).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from vslam.backend.bundle_adjustment import BundleProblem, BundleSolution
 from vslam.backend.local_mapping import assemble
 from vslam.backend.loop_correction import carry_landmarks
-from vslam.camera import Camera
+from vslam.camera import DISPARITY_WEIGHT, Camera
 from vslam.geometry import compose, inverse, orthonormalised
 from vslam.kernels import kernel
 from vslam.map import Map
-from vslam.map_kernels import refresh_landmarks, unlink
+from vslam.map_kernels import refresh_landmarks, resolve, unlink
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,12 @@ class GlobalSnapshot:
     Attributes:
         keyframes: ``(K,)`` int64 keyframe id of each camera of the problem.
         landmarks: ``(P,)`` int32 landmark id of each point of the problem.
-        rows: ``(O,)`` int64 row of each observation in the observation arrays of the map.
+        rows: ``(O,)`` int64 row of each observation in the observation arrays of the map. It is -1
+            for the observations of revisits.
         n_keyframes, n_landmarks: first ids of the keyframes and landmarks that are newer than the
             snapshot.
+        n_revisits: number of revisits of the map, which are the first cameras of the problem. The
+            keyframes follow.
     """
 
     problem: BundleProblem
@@ -39,11 +42,12 @@ class GlobalSnapshot:
     rows: NDArray[np.int64]
     n_keyframes: int
     n_landmarks: int
+    n_revisits: int
 
 
 def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
     """Copy the map, without culled keyframes and landmarks, into a bundle problem for global bundle
-    adjustment.
+    adjustment. The revisits of the map are further cameras, which are optimised.
 
     The first keyframe of each connected part of the map is held fixed, because nothing else
     determines the position of this part. Two keyframes are connected if they observe a common
@@ -56,7 +60,43 @@ def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
     free, fixed = living[~first], living[first]
     keyframes = np.concatenate([free, fixed])
     problem, rows = assemble(map_, free, fixed, landmarks, camera)
-    return GlobalSnapshot(problem, keyframes, landmarks, rows, map_.n_keyframes, map_.n_landmarks)
+    n_revisits = len(map_.revisits)
+    if n_revisits:
+        problem, rows = _with_revisits(map_, problem, rows, landmarks)
+    return GlobalSnapshot(
+        problem, keyframes, landmarks, rows, map_.n_keyframes, map_.n_landmarks, n_revisits
+    )
+
+
+def _with_revisits(
+    map_: Map, problem: BundleProblem, rows: NDArray[np.int64], landmarks: NDArray[np.int32]
+) -> tuple[BundleProblem, NDArray[np.int64]]:
+    """Add the revisits to the cameras of a bundle problem, before all other cameras. ``rows`` and
+    ``landmarks`` are those of ``GlobalSnapshot``."""
+    revisits = map_.revisits.observing(resolve(map_.arrays, map_.revisits.landmark))
+    seen = np.flatnonzero(revisits.landmark >= 0)
+    certainty = revisits.certainty[seen].astype(np.float64)
+    point_of = np.empty(map_.n_landmarks, np.int64)
+    point_of[landmarks] = np.arange(len(landmarks))
+    known = np.diff(problem.first)
+    point = np.r_[np.repeat(np.arange(len(known)), known), point_of[revisits.landmark[seen]]]
+    order = np.argsort(point, kind="stable")  # each revisit follows the keyframes
+    camera = np.repeat(np.arange(len(revisits)), np.diff(revisits.first))[seen]
+    weight = map_.scales[revisits.octave[seen]] ** -2.0 * certainty
+    T_keyframe = np.array([map_.keyframe_pose(k) for k in revisits.keyframe.tolist()])
+    together = replace(
+        problem,
+        T_cw=np.concatenate([revisits.T_c_keyframe @ T_keyframe, problem.T_cw]),
+        n_free=len(revisits) + problem.n_free,
+        first=np.searchsorted(point[order], np.arange(len(known) + 1)),
+        camera=np.r_[problem.camera + len(revisits), camera][order],
+        uvr=np.concatenate([problem.uvr, revisits.uvr[seen]])[order],
+        inverse_sigma2=np.r_[problem.inverse_sigma2, weight][order],
+        disparity_weight=np.r_[problem.disparity_weights(), DISPARITY_WEIGHT / np.sqrt(certainty)][
+            order
+        ],
+    )
+    return together, np.r_[rows, np.full(len(seen), -1)][order]
 
 
 @kernel
@@ -100,7 +140,8 @@ def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution
     a = map_.arrays
     T_cw_old = a.T_cw[: map_.n_keyframes].copy()
     living = a.keyframe_alive[snapshot.keyframes]
-    a.T_cw[snapshot.keyframes[living]] = solution.T_cw[living]
+    T_revisit, T_keyframe = np.split(solution.T_cw, [snapshot.n_revisits])
+    a.T_cw[snapshot.keyframes[living]] = T_keyframe[living]
     # A parent is older than its children, so it has already been moved.
     for k in range(snapshot.n_keyframes, map_.n_keyframes):
         parent = map_.parents[k]
@@ -111,8 +152,15 @@ def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution
     living = a.landmark_alive[snapshot.landmarks]
     a.xyz[snapshot.landmarks[living]] = solution.points[living]
     observed = np.repeat(snapshot.landmarks, np.diff(snapshot.problem.first))
-    remove_unchanged(a, snapshot.rows[~solution.inlier], observed[~solution.inlier])
+    outlier = ~solution.inlier & (snapshot.rows >= 0)
+    remove_unchanged(a, snapshot.rows[outlier], observed[outlier])
     refresh_landmarks(a, map_.living_landmarks().astype(np.int32), map_.scales)
+    reused = map_.revisits.keyframe[: snapshot.n_revisits].tolist()
+    map_.revisits = map_.revisits.moved(
+        np.array(
+            [T @ inverse(map_.keyframe_pose(k)) for T, k in zip(T_revisit, reused, strict=True)]
+        )
+    )
 
 
 @kernel

@@ -117,7 +117,8 @@ def move_keyframes_similarly(
     """Move keyframes by similarity transforms. Each landmark is moved and scaled with its anchor
     keyframe (section VII-C of the ORB-SLAM paper).
 
-    The poses of culled keyframes, which are stored relative to other keyframes, are scaled as well.
+    The poses of culled keyframes and of revisits, which are stored relative to other keyframes, are
+    scaled as well.
     ``map_.keyframes.unit_scale`` is multiplied by the scales.
 
     Args:
@@ -140,6 +141,7 @@ def move_keyframes_similarly(
     growth[culled] = growth[map_.parents[culled]]
     map_.keyframes.T_c_parent[culled, :3, 3] *= growth[culled, None]
     map_.keyframes.unit_scale[:n] *= growth
+    map_.revisits = map_.revisits.scaled(growth)
     refresh_landmarks(a, map_.living_landmarks().astype(np.int32), map_.scales)
     return growth
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vslam.camera import Camera
 from vslam.config import LearnedMatchingConfig
 from vslam.frontend.pnp import ransac_pose
-from vslam.frontend.pose import optimise_pose
+from vslam.frontend.pose import optimise_pose, pose_covariance
 from vslam.geometry import Matrix, transform
 from vslam.loopclosure.local_matching import (
     DescriptorMaps,
@@ -54,6 +54,7 @@ class PoseEstimate(NamedTuple):
         n_matches: number of landmarks that were matched near their predicted positions, including
             outliers.
         T_cw: ``(4, 4)`` pose of the camera (world to camera), in the world frame of the landmarks.
+        covariance: ``(6, 6)`` covariance of the error of this pose (``LoopEdge.covariance``).
     """
 
     landmarks: NDArray[np.int32]
@@ -61,6 +62,7 @@ class PoseEstimate(NamedTuple):
     seen: NDArray[np.bool_]
     n_matches: int
     T_cw: Matrix
+    covariance: Matrix
 
 
 def localise(
@@ -146,14 +148,23 @@ def guided_search(
             found[chosen] = locate_near(xy, expected[chosen], view.maps, query, reach, least).xy
             start += len(view.landmarks)
         hit = np.flatnonzero(np.isfinite(found[:, 0]))
-        T_cw, inlier = optimise_pose(
-            T_cw, xyz[hit], *_observed(found[hit], query, config), camera.intrinsics
-        )
+        observed = _observed(found[hit], query, config)
+        T_cw, inlier = optimise_pose(T_cw, xyz[hit], *observed, camera.intrinsics)
+    covariance = pose_covariance(
+        T_cw,
+        xyz[hit][inlier],
+        observed[0][inlier],
+        observed[1][inlier],
+        camera.intrinsics,
+        np.full(np.count_nonzero(inlier), camera.intrinsics[5]),
+    )
     expected = project(xyz, T_cw, camera)
     seen = np.zeros(len(landmarks), np.bool_)
     seen[hit[inlier]] = True
     visible = np.flatnonzero(np.isfinite(expected[:, 0]))
-    return PoseEstimate(landmarks[visible], expected[visible], seen[visible], len(hit), T_cw)
+    return PoseEstimate(
+        landmarks[visible], expected[visible], seen[visible], len(hit), T_cw, covariance
+    )
 
 
 def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:

@@ -158,7 +158,7 @@ def verify_learned(
     place = collect_landmarks(map_.arrays, np.array(keyframes, np.int64), map_.n_landmarks)
     guided = guided_match(map_, query, place, estimate.T_cw, camera, gates)
     if np.count_nonzero(guided.seen) >= gates.min_inliers:
-        estimate = estimate._replace(T_cw=guided.T_cw)
+        estimate = estimate._replace(T_cw=guided.T_cw, covariance=guided.covariance)
         pairs = guided.feature[guided.seen], guided.landmarks[guided.seen]
         feature, landmark = joined(pairs, (feature, landmark))
     T_query_match = orthonormalised(estimate.T_cw @ inverse(map_.keyframe_pose(match)))
@@ -169,6 +169,7 @@ def verify_learned(
         T_query_match=T_query_match,
         features=feature,
         landmarks=landmark,
+        covariance=estimate.covariance,
     )
     if camera.monocular:
         scale = relative_scale(map_, edge, estimate.T_cw, default=np.nan)

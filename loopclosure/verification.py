@@ -31,7 +31,7 @@ from vslam.frontend.matching import (
     search_all,
     search_windows,
 )
-from vslam.frontend.pose import optimise_pose
+from vslam.frontend.pose import optimise_pose, pose_covariance
 from vslam.geometry import Matrix, inverse, orthonormalised, transform
 from vslam.loopclosure.sim3_ransac import ObservedPoints, align
 from vslam.loops import LoopCandidate, LoopEdge
@@ -54,6 +54,7 @@ class GuidedMatches(NamedTuple):
         n_matches: number of landmarks that were matched near their predicted positions, including
             outliers.
         T_cw: ``(4, 4)`` pose of the camera (world to camera), in the world frame of the landmarks.
+        covariance: ``(6, 6)`` covariance of the error of this pose (``LoopEdge.covariance``).
     """
 
     landmarks: NDArray[np.int32]
@@ -61,6 +62,7 @@ class GuidedMatches(NamedTuple):
     uv: Matrix
     n_matches: int
     T_cw: Matrix
+    covariance: Matrix
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -119,6 +121,7 @@ def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationC
         T_query_match=T_query_match,
         features=guided.feature[guided.seen],
         landmarks=guided.landmarks[guided.seen],
+        covariance=guided.covariance,
     )
     if camera.monocular:
         scale = relative_scale(map_, edge, guided.T_cw, default=edge.scale)
@@ -252,7 +255,7 @@ def guided_match(
     features = Searchable(a.xy[rows], a.octave[rows], a.u_right[rows], a.descriptor[rows], grid)
     free = np.ones(rows.stop - rows.start, np.bool_)
     for window in (config.first_window, config.second_window):
-        uvr, radius, octave = predict_view(
+        expected, radius, octave = predict_view(
             T_cw,
             a.xyz[landmarks],
             a.normal[landmarks],
@@ -264,23 +267,26 @@ def guided_match(
             window,
         )
         found, _ = search_windows(
-            Projections(uvr, radius, octave - 1, octave + 1, a.landmark_descriptor[landmarks]),
+            Projections(expected, radius, octave - 1, octave + 1, a.landmark_descriptor[landmarks]),
             features,
             free,
             config.guided_distance,
             1.0,
         )
         hit = np.flatnonzero(found >= 0)
-        T_cw, inlier = optimise_pose(
-            T_cw,
-            a.xyz[landmarks[hit]],
-            *_observations(map_, found[hit].astype(np.int64) + rows.start),
-            camera.intrinsics,
-        )
+        xyz = a.xyz[landmarks[hit]]
+        uvr, inverse_sigma2 = _observations(map_, found[hit].astype(np.int64) + rows.start)
+        T_cw, inlier = optimise_pose(T_cw, xyz, uvr, inverse_sigma2, camera.intrinsics)
+    disparity_weight = np.full(np.count_nonzero(inlier), camera.intrinsics[5])
+    covariance = pose_covariance(
+        T_cw, xyz[inlier], uvr[inlier], inverse_sigma2[inlier], camera.intrinsics, disparity_weight
+    )
     visible = np.flatnonzero(radius > 0)
     feature = np.full(len(landmarks), -1, np.int32)
     feature[hit[inlier]] = found[hit[inlier]]
-    return GuidedMatches(landmarks[visible], feature[visible], uvr[visible, :2], len(hit), T_cw)
+    return GuidedMatches(
+        landmarks[visible], feature[visible], expected[visible, :2], len(hit), T_cw, covariance
+    )
 
 
 def _rejection_reason(

@@ -403,7 +403,7 @@ def test_loop_closing_restored_from_its_state_closes_the_loop_that_waits():
         return LoopClosing(NoDetector(), Verifier(config, CAMERA), CAMERA, config, threads=1)
 
     stopped, restored, fresh = create(), create(), create()
-    stopped.count_reused_keyframe(last - 1)
+    stopped.count_reused_keyframe(map_, new=True)
     stopped.consider(map_, last - 1, oracle.query(last - 1, map_))
     assert stopped.edges[-1].reason == "verified by 1 of 2 keyframes"
     assert fresh.state() != stopped.state()

@@ -38,6 +38,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
         "vslam.map_kernels",
         "vslam.calibration",
     ),
+    ("vslam.revisits",),
     ("vslam.map", "vslam.frame_poses", "vslam.states"),
     ("vslam.map_view", "vslam.shared_map"),
     ("vslam.frontend", "vslam.backend", "vslam.loopclosure", "vslam.datasets", "vslam.maps"),

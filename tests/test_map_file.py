@@ -27,6 +27,7 @@ from vslam.map_kernels import refresh_landmarks
 from vslam.maps import new_output
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
+from vslam.revisits import Revisits
 from vslam.slam import Slam
 
 CONFIG = Config()
@@ -49,7 +50,23 @@ def slam(ring) -> Slam:
     """A ``Slam`` after half a lap. One of its keyframes is culled."""
     done = driven(Slam(CAMERA, CONFIG, create_detector("bow", CONFIG), threads=1), ring, range(100))
     assert len(done.map.living_keyframes()) < done.map.n_keyframes
+    done.map.revisits = as_revisit(done.map, int(done.map.living_keyframes()[2]))
     return done
+
+
+def as_revisit(map_: Map, keyframe: int) -> Revisits:
+    """Return a revisit that observes what a keyframe observes."""
+    a, rows = map_.arrays, map_.rows(keyframe)
+    seen = np.flatnonzero(a.landmark[rows] >= 0) + rows.start
+    return Revisits(
+        np.array([keyframe]),
+        np.eye(4)[None],
+        np.array([0, len(seen)]),
+        a.landmark[seen],
+        np.column_stack([a.xy[seen], a.u_right[seen]]),
+        a.octave[seen],
+        a.certainty[seen],
+    )
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +135,15 @@ def test_all_of_a_map_comes_back(slam, file, check_map):
             assert np.array_equal(getattr(a, name)[ids], getattr(b, name)[same])
     assert (np.diff(b.first_keyframe[:m]) >= 0).all()
     assert np.array_equal(keyframes[after.parents[1:]], before.parents[keyframes[1:]])
+
+
+def test_revisits_come_back(slam, file):
+    before, after = slam.map, load_map(file).map
+    keyframe = int(after.revisits.keyframe[0])
+    assert before.living_keyframes()[keyframe] == before.revisits.keyframe[0]
+    expected = as_revisit(after, keyframe)
+    for name, values in vars(after.revisits).items():
+        assert np.array_equal(values, getattr(expected, name), equal_nan=True), name
 
 
 def test_observations_keep_their_order(slam, file):
@@ -311,13 +337,13 @@ def test_foreign_files_are_refused(tmp_path):
 
 
 def test_other_schemas_are_named(file, tmp_path):
-    newer = as_header(header_of(file) | {"schema": 10})
-    assert "schema 10, but this version of vslam reads schema 9" in refusal(
+    newer = as_header(header_of(file) | {"schema": 11})
+    assert "schema 11, but this version of vslam reads schema 10" in refusal(
         changed(file, tmp_path / "n.npz", header=newer)
     )
     old = tmp_path / "old.npz"
     np.savez(old, schema=1, keyframe_first_row=np.zeros(1, np.int64))
-    assert "reads schema 9; make the map again" in refusal(old)
+    assert "reads schema 10; make the map again" in refusal(old)
 
 
 def damage(name: str, position: tuple[int, ...], value: float):
@@ -364,6 +390,13 @@ def mirror(file: Path, to: Path) -> Path:
         damage("frame_reference", (2,), 10**6),
         damage("frame_timestamp", (2,), -1.0),
         damage("detector_words_first", (2,), 10**9),
+        damage("revisit_keyframe", (0,), 10**6),
+        damage("revisit_first", (1,), 10**9),
+        damage("revisit_landmark", (0,), 10**8),
+        damage("revisit_octave", (0,), 200),
+        damage("revisit_certainty", (0,), 0),
+        damage("revisit_uvr", (0, 0), np.nan),
+        damage("revisit_T_c_keyframe", (0, 0, 0), 5.0),
     ],
 )
 def test_damage_by_hand_is_refused(apply, file, tmp_path):

@@ -22,6 +22,7 @@ from vslam.frontend.tracking import TrackingContext, track_local_map
 from vslam.geometry import inverse, se3_exp
 from vslam.loopclosure.detector import NoDetector
 from vslam.map import Map
+from vslam.map_frames import add_revisit
 from vslam.map_kernels import erase_landmark
 from vslam.map_view import MapView
 from vslam.mapping import Mapper
@@ -67,8 +68,12 @@ class Closing:
     def close(self, map_: Map, search: LoopSearch) -> None:
         assert search.loop is None
 
-    def count_reused_keyframe(self, keyframe: int) -> bool:
+    def count_reused_keyframe(self, map_: Map, *, new: bool) -> bool:
+        assert new
         return self.is_due
+
+    def adjust_after_revisits(self, map_: Map) -> None:
+        pass
 
     def conclude(self, map_: Map) -> None:
         if self._job is not None:
@@ -516,6 +521,20 @@ def test_a_place_is_old_when_its_keyframe_is(known_after_s, known):
         shared = np.intersect1d(frame.landmark, map_.landmarks_of(0))
         assert (place.keyframe, place.n_shared) == (0, len(shared))
         assert place.n_place == 0  # only two keyframes see anything
+
+
+def test_what_is_seen_at_a_known_place_is_kept_once():
+    drive = Drive(known_after_s=0.3)
+    drive.steps([0, 3], 6)
+    mapper, frame = drive.mapper, drive.last
+    mapper.use_existing_keyframe(mapper.find_old_place(frame), frame)
+    revisits = mapper.map.revisits
+    assert revisits.keyframe.tolist() == [0]
+    np.testing.assert_array_equal(revisits.landmark, frame.landmark[frame.landmark >= 0])
+    T_cw = revisits.T_c_keyframe[0] @ mapper.map.keyframe_pose(0)
+    np.testing.assert_allclose(T_cw, frame.T_cw, atol=1e-12)
+    assert not add_revisit(mapper.map, 0, frame, 1)
+    assert len(mapper.map.revisits) == 1
 
 
 @pytest.mark.parametrize("is_due", [False, True])

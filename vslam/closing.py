@@ -78,6 +78,7 @@ class LoopClosing:
         self._executor = ThreadPoolExecutor(1, "global-adjustment") if threads > 1 else None
         self._global: _PendingAdjustment | None = None
         self._followed = 0  # number of frames for which an old keyframe was reused
+        self._new_revisits = 0  # number of revisits since the last global bundle adjustment began
 
     def process(
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
@@ -130,33 +131,50 @@ class LoopClosing:
 
     def state(self) -> ClosingState:
         """Return the state for a checkpoint, without the loop detector and the images."""
-        return ClosingState(self._consistency.state(), self.verifier.state(), self._followed)
+        return ClosingState(
+            self._consistency.state(), self.verifier.state(), self._followed, self._new_revisits
+        )
 
     def restore(self, state: ClosingState) -> None:
         """Restore a state that the method ``state`` returned."""
         self._consistency.restore(state.consistency)
         self.verifier.restore(state.verifier)
-        self._followed = state.followed
+        self._followed, self._new_revisits = state.followed, state.new_revisits
 
     @property
     def is_adjusting(self) -> bool:
         """Whether a global bundle adjustment is running, or its result has not been merged yet."""
         return self._global is not None
 
-    def count_reused_keyframe(self, keyframe: int) -> bool:
+    def count_reused_keyframe(self, map_: Map, *, new: bool) -> bool:
         """Record that an old keyframe became the reference keyframe instead of a new keyframe.
 
         The result of the global bundle adjustment is merged after a certain number of keyframes. A
-        reused keyframe also counts towards this number.
+        reused keyframe also counts towards this number. If many places have been revisited since
+        the last adjustment, another adjustment begins.
 
         Args:
-            keyframe: id of the newest keyframe.
+            new: whether the map has a new revisit.
 
         Returns:
             Whether the result of the global bundle adjustment must be merged now.
         """
         self._followed += 1
-        return self._is_due(keyframe)
+        self._new_revisits += new
+        enough = self._config.loops.revisits_share * len(map_.living_keyframes())
+        if self._new_revisits >= enough:
+            self.adjust_after_revisits(map_)
+        return self._is_due(map_.n_keyframes - 1)
+
+    def adjust_after_revisits(self, map_: Map) -> None:
+        """Start a global bundle adjustment if places were revisited since the last one began.
+
+        Nothing is done if only few places were revisited, or while an adjustment is running. The
+        map is only read.
+        """
+        if self._global is None and self._new_revisits >= self._config.loops.min_revisits:
+            with self._failure_reported("Global bundle adjustment after a loop"):
+                self._global = self._start_global(map_, map_.n_keyframes - 1)
 
     def merge_adjustment_if_due(self, map_: Map, keyframe: int) -> None:
         """Merge the result of the global bundle adjustment if it is due at this keyframe."""
@@ -167,7 +185,8 @@ class LoopClosing:
         return self._global is not None and keyframe + self._followed >= self._global.due
 
     def conclude(self, map_: Map) -> None:
-        """At the end of a drive, close a verified loop that has not been confirmed yet.
+        """At the end of a drive, close a verified loop that has not been confirmed yet, and start a
+        last global bundle adjustment if places were revisited.
 
         Normally, a later keyframe confirms each loop. At the end of a drive, there is no later
         keyframe. The loop is then closed if an earlier keyframe confirms it
@@ -181,6 +200,8 @@ class LoopClosing:
                 if found is not None:
                     break
         self.close(map_, LoopSearch(edges, found))
+        self.finish(map_)
+        self.adjust_after_revisits(map_)
 
     def finish(self, map_: Map) -> None:
         """Wait for the running global bundle adjustment, if there is one, and merge its result.
@@ -267,7 +288,7 @@ class LoopClosing:
 
     def _start_global(self, map_: Map, keyframe: int) -> _PendingAdjustment:
         config = self._config.loops
-        snapshot = take_snapshot(map_, self._camera)
+        snapshot, self._new_revisits = take_snapshot(map_, self._camera), 0
         wait = 1 + len(snapshot.problem.camera) // config.observations_per_keyframe
         stop = threading.Event()
 

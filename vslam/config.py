@@ -621,6 +621,12 @@ class LoopConfig(Section):
     """The result of global bundle adjustment is merged `1 + n // observations_per_keyframe`
     keyframes after its loop, where n is the number of observations. With a smaller value, mapping
     waits for the result less often. [own]"""
+    min_revisits: int = Field(5, ge=1)
+    """Where the camera revisits a known place, the map is adjusted again after at least this many
+    revisits: when the camera leaves known places, and at the end of the drive. [own]"""
+    revisits_share: float = Field(0.05, ge=0)
+    """While the camera stays at known places, the map is adjusted again when the number of new
+    revisits reaches this fraction of the number of keyframes. [own]"""
 
 
 class BowConfig(Section):

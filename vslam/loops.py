@@ -81,6 +81,9 @@ class LoopEdge:
             the candidate was rejected before this pose was computed.
         features: ``(N,)`` int32, indices of the inlier features within the query keyframe.
         landmarks: ``(N,)`` int32, the landmark that each of these features observes.
+        covariance: ``(6, 6)`` float64 covariance of the error ``xi = [v, w]`` of ``T_query_match``,
+            in radians and in the unit of its translation. ``exp(xi) T_query_match`` is the true
+            relative pose. None if it is unknown.
         scale: number of map units around the keyframe ``query`` per map unit around the keyframe
             ``match``. It is 1 in metric maps. In monocular maps, it differs from 1 by the scale
             drift.
@@ -97,6 +100,7 @@ class LoopEdge:
     T_query_match: NDArray[np.float64] | None = None
     features: NDArray[np.int32] | None = None
     landmarks: NDArray[np.int32] | None = None
+    covariance: NDArray[np.float64] | None = None
     scale: float = 1.0
     matched_by: Literal["orb", "learned"] = "orb"
     proposed_by: str = ""
@@ -127,11 +131,12 @@ class LoopEdge:
 def loop_entry(loop: LoopEdge) -> dict[str, Any]:
     """Convert a loop edge to a JSON object, without its features and landmarks."""
     entry = {name: value for name, value in vars(loop).items() if name not in _LEFT_OUT}
-    T = loop.T_query_match
-    return entry | {"T_query_match": None if T is None else T.tolist()}
+    arrays = {name: entry[name] for name in _MATRICES}
+    return entry | {name: None if M is None else M.tolist() for name, M in arrays.items()}
 
 
 _LEFT_OUT = ("features", "landmarks")
+_MATRICES = {"T_query_match": (4, 4), "covariance": (6, 6)}
 
 
 def loop_of(entry: dict[str, Any]) -> LoopEdge:
@@ -140,9 +145,11 @@ def loop_of(entry: dict[str, Any]) -> LoopEdge:
     Raises:
         KeyError, TypeError, ValueError: the object does not describe a loop edge.
     """
-    T = entry["T_query_match"]
-    T_query_match = None if T is None else np.array(T, np.float64).reshape(4, 4)
-    return LoopEdge(**{**entry, "T_query_match": T_query_match})
+    matrices = {
+        name: None if entry[name] is None else np.array(entry[name], np.float64).reshape(shape)
+        for name, shape in _MATRICES.items()
+    }
+    return LoopEdge(**{**entry, **matrices})
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from vslam.features import Features
 from vslam.geometry import compose, inverse, orthonormalised
 from vslam.loops import LoopEdge
 from vslam.map_kernels import count_shared, detach_keyframe, resolve
+from vslam.revisits import Revisits
 
 NONE = -1
 _FEW_LANDMARKS = 8192  # they take about 1 MB; it is not worth dropping fewer landmarks
@@ -162,6 +163,7 @@ class Map:
     Attributes:
         n_keyframes, n_landmarks: number of keyframes and landmarks, including culled ones.
         n_rows: number of keypoints of all keyframes.
+        revisits: observations of frames at known places.
     """
 
     def __init__(self, scales: NDArray[np.float64]) -> None:
@@ -171,6 +173,7 @@ class Map:
         self.n_landmarks = 0
         self.n_rows = 0
         self.scalars = Scalars()
+        self.revisits = Revisits()
         self.arrays = Arrays()
         self.keyframes = KeyframeTable()
         self._reserve_keyframes(64)
@@ -312,7 +315,7 @@ class Map:
         return of_arrays | {name: column[: self.n_keyframes] for name, column in of_keyframes}
 
     def with_columns(self, columns: dict[str, NDArray]) -> Map:
-        """Create a map with the given arrays and the scalars of this map.
+        """Create a map with the given arrays, and the scalars and revisits of this map.
 
         The arrays are not copied. Their names are the names that ``columns()`` returns.
         """
@@ -355,7 +358,9 @@ class Map:
             values[len(living) : self.n_landmarks] = 0
         a.landmark[: self.n_rows] = new_id[a.landmark[: self.n_rows]]
         self.n_landmarks = len(living)
-        return new_id[resolved]
+        new_id = np.append(new_id[resolved], np.int32(NONE))  # again for -1
+        self.revisits = self.revisits.observing(new_id[self.revisits.landmark])
+        return new_id[:-1]
 
     def rows(self, keyframe: int) -> slice:
         """Return the range of indices of a keyframe's keypoints in ``Arrays``."""
@@ -456,3 +461,15 @@ def loop_of_living(map_: Map, loop: LoopEdge) -> LoopEdge:
         T = compose(T, map_.keyframes.T_c_parent[match])
         match = int(map_.parents[match])
     return replace(loop, query=query, match=match, T_query_match=orthonormalised(T))
+
+
+def revisits_of_living(map_: Map) -> Revisits:
+    """Return the revisits of a map, relative to keyframes that have not been culled. A culled
+    keyframe is replaced by its parent."""
+    revisits, table = map_.revisits, map_.keyframes
+    keyframe, T = revisits.keyframe.copy(), revisits.T_c_keyframe.copy()
+    for revisit in np.flatnonzero(~map_.arrays.keyframe_alive[keyframe]):
+        culled = keyframe[revisit]
+        T[revisit] = orthonormalised(compose(T[revisit], table.T_c_parent[culled]))
+        keyframe[revisit] = table.parent[culled]
+    return replace(revisits, keyframe=keyframe, T_c_keyframe=T)

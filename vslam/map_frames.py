@@ -24,6 +24,8 @@ from vslam.map_kernels import (
     refresh_landmarks,
     resolve,
 )
+from vslam.reprojection import stack_uvr
+from vslam.revisits import Revisits
 from vslam.starter import TwoViewStart
 from vslam.trajectory import Trajectory
 
@@ -182,6 +184,33 @@ def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | 
     if shared[best] == 0:
         return None
     return OldPlace(best, int(shared[best]), count_seen_by(map_.arrays, best, 3))
+
+
+def add_revisit(map_: Map, keyframe: int, frame: Frame, certainty: NDArray[np.uint8] | int) -> bool:
+    """Keep what a frame at a known place observes, unless there is a revisit for this place.
+
+    Args:
+        keyframe: the old keyframe that becomes the reference keyframe of the frame.
+        certainty: ``(N,)`` certainty of the features of the frame (``Arrays.certainty``).
+
+    Returns:
+        Whether the observations were kept.
+    """
+    if keyframe in map_.revisits.keyframe:
+        return False
+    features = frame.refined_features()
+    tracked = np.flatnonzero(frame.landmark >= 0)
+    new = Revisits(
+        np.array([keyframe]),
+        (frame.T_cw @ inverse(map_.keyframe_pose(keyframe)))[None],
+        np.array([0, len(tracked)]),
+        frame.landmark[tracked],
+        stack_uvr(features.xy[tracked], features.u_right[tracked]).astype(np.float32),
+        features.octave[tracked],
+        np.broadcast_to(np.uint8(certainty), len(features))[tracked],
+    )
+    map_.revisits = map_.revisits.followed_by(new)
+    return True
 
 
 def keyframe_trajectory(map_: Map) -> Trajectory:

@@ -41,6 +41,7 @@ from vslam.map_frames import (
     LandmarkCounts,
     OldPlace,
     add_frame,
+    add_revisit,
     add_two_views,
     count_shared_landmarks,
     drop_culled_landmarks,
@@ -286,6 +287,7 @@ class Mapper:
         """
         with self._changing() as map_:
             self._make_room(map_, frame)
+            self._closing.adjust_after_revisits(map_)
             certainty = certainty_of(frame, self._config.alignment)
             keyframe = add_frame(map_, frame, certainty, self.reference, predicted=predicted)
             map_stereo_points(map_, keyframe, self._camera, self._config)
@@ -352,12 +354,14 @@ class Mapper:
 
     def use_existing_keyframe(self, place: OldPlace, frame: PlacedFrame) -> None:
         """Make an existing keyframe the reference keyframe instead of inserting a new keyframe."""
-        map_ = self.settle()
+        with self._changing() as map_:
+            certainty = certainty_of(frame, self._config.alignment)
+            new = add_revisit(map_, place.keyframe, frame, certainty)
         self.last_timestamp = frame.timestamp
         self.frames.follow(frame.index, place.keyframe, frame.T_cw)
         self._known_place = patches_of_frame(frame, map_.scales)
         self.refer_to(place.keyframe)
-        if self._closing.count_reused_keyframe(self.n_keyframes - 1):
+        if self._closing.count_reused_keyframe(map_, new=new):
             self.last_frame = frame.index
             self._start(self._closing.finish)
 

@@ -135,11 +135,13 @@ class ClosingState:
     Attributes:
         consistency, verifier: the states of the consistency test and of the verifier.
         followed: how many times an old keyframe was reused instead of inserting a new keyframe.
+        new_revisits: number of revisits since the last global bundle adjustment began.
     """
 
     consistency: ConsistencyState = field(default_factory=ConsistencyState)
     verifier: VerifierState = field(default_factory=VerifierState)
     followed: int = 0
+    new_revisits: int = 0
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from vslam.map import (
 )
 from vslam.maps.checkpoint import arrays_of, checked_checkpoint
 from vslam.maps.stored_map import StoredMap, TruthAlignment, observations
+from vslam.revisits import Revisits
 
 # These columns are not in the file. They are computed from keyframe_first_row and from the list of
 # observations, which is sorted by landmark.
@@ -53,8 +54,9 @@ def _layout(name: str, in_file: str) -> tuple[type, tuple[str | int, ...]]:
     return empty.dtype.type, (size, *empty.shape[1:])
 
 
-# K keyframes, L landmarks, R keypoints, O observations, E loops, F frames of the last drive. K+1
-# and L+1 are the lengths of CSR offsets, which have one element more than there are items.
+# K keyframes, L landmarks, R keypoints, O observations, E loops, V revisits with S observations, F
+# frames of the last drive. K+1, L+1 and V+1 are the lengths of CSR offsets, which have one element
+# more than there are items.
 ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "scales": (np.float64, ("levels",)),
     **{in_file: _layout(name, in_file) for name, in_file in FILE_NAMES.items()},
@@ -66,13 +68,21 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "loop_score": (np.float64, ("E",)),
     "loop_counts": (np.int64, ("E", 2)),
     "loop_learned": (np.bool_, ("E",)),
+    "loop_covariance": (np.float64, ("E", 6, 6)),
+    "revisit_keyframe": (np.int64, ("V",)),
+    "revisit_T_c_keyframe": (np.float64, ("V", 4, 4)),
+    "revisit_first": (np.int64, ("V+1",)),
+    "revisit_landmark": (np.int32, ("S",)),
+    "revisit_uvr": (np.float32, ("S", 3)),
+    "revisit_octave": (np.uint8, ("S",)),
+    "revisit_certainty": (np.uint8, ("S",)),
     "frame_timestamp": (np.float64, ("F",)),
     "frame_reference": (np.int64, ("F",)),
     "frame_T_c_reference": (np.float64, ("F", 4, 4)),
     "frame_tracked": (np.bool_, ("F",)),
     "frame_unit_scale": (np.float64, ("F",)),
 }
-_MAY_BE_NAN = {"row_u_right"}
+_MAY_BE_NAN = {"row_u_right", "revisit_uvr", "loop_covariance"}
 _MOST = 1e12  # metres, pixels or seconds; the product of a few smaller numbers is finite
 _ROTATION_TOLERANCE = 1e-6
 _MOST_PIXELS = 1e6  # width, height and focal length of a camera
@@ -103,6 +113,7 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
     sizes = _check_shapes(data)
     map_ = _build_map(data, sizes)
     map_.scalars = _scalars(header["scalars"])
+    map_.revisits = _revisits(data, sizes)
     checkpoint = None
     if header["checkpoint"] is not None:
         arrays = {name: data[f"checkpoint_{name}"] for name in arrays_of(header["checkpoint"])}
@@ -205,6 +216,18 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     return Map(scales).with_columns(columns)
 
 
+def _revisits(data: dict[str, NDArray], sizes: dict[str, int]) -> Revisits:
+    revisits = Revisits(**{name: data[f"revisit_{name}"] for name in vars(Revisits())})
+    _check_ids("revisit_keyframe", revisits.keyframe, sizes["K"])
+    _check_rigid("revisit_T_c_keyframe", revisits.T_c_keyframe)
+    _check_first("revisit_first", revisits.first, sizes["S"])
+    _check_ids("revisit_landmark", revisits.landmark, sizes["L"], least=NONE)
+    _check_ids("revisit_octave", revisits.octave, len(data["scales"]))
+    _require(bool((revisits.certainty > 0).all()), "revisit_certainty")
+    _require(bool(np.isfinite(revisits.uvr[:, :2]).all()), "revisit_uvr")
+    return revisits
+
+
 def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:
     """Check that every chain of ``merged_into`` ends at a landmark that was not culled, or at
     -1."""
@@ -234,14 +257,16 @@ def _loops(data: dict[str, NDArray], n: int) -> tuple[LoopEdge, ...]:
             T_query_match=T,
             scale=scale,
             matched_by="learned" if learned else "orb",
+            covariance=covariance if np.isfinite(covariance).all() else None,
         )
-        for (query, match), score, (n_matches, n_inliers), T, scale, learned in zip(
+        for (query, match), score, (n_matches, n_inliers), T, scale, learned, covariance in zip(
             data["loop_ends"].tolist(),
             data["loop_score"].tolist(),
             data["loop_counts"].tolist(),
             data["loop_T_query_match"],
             data["loop_scale"].tolist(),
             data["loop_learned"].tolist(),
+            data["loop_covariance"],
             strict=True,
         )
     )

@@ -105,6 +105,7 @@ def checkpoint_entry(checkpoint: Checkpoint) -> dict[str, Any]:
             "resting_until": closing.verifier.resting_until,
             "in_vain": closing.verifier.failed_similarity,
             "followed": closing.followed,
+            "new_revisits": closing.new_revisits,
         },
     }
 
@@ -270,4 +271,5 @@ def _closing_of(entry: dict[str, Any], n_keyframes: int) -> ClosingState:
         ConsistencyState(places, verified, _count(entry["turn"])),
         VerifierState(_count(entry["resting_until"]), _number(entry["in_vain"])),
         _count(entry["followed"]),
+        _count(entry["new_revisits"]),
     )

@@ -21,14 +21,15 @@ from vslam.camera import Camera
 from vslam.errors import InputError
 from vslam.frame_poses import FrameTable
 from vslam.machine import versions
-from vslam.map_kernels import gather_observations
+from vslam.map_kernels import gather_observations, resolve
 from vslam.maps.checked_map import FILE_NAMES, DamagedMapError, camera_of, checked_map
 from vslam.maps.checkpoint import checkpoint_arrays, checkpoint_entry
 from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
 from vslam.untrusted import ARCHIVE_ERRORS, read_json, require_memory
 
-SCHEMA = 9
+SCHEMA = 10
+_UNKNOWN = np.full((6, 6), np.nan)  # covariance
 _FOREIGN = "not a map of vslam; give a map.npz or the folder of a run"
 
 
@@ -137,7 +138,13 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
             [(loop.n_matches, loop.n_inliers) for loop in loops], np.int64
         ).reshape(-1, 2),
         "loop_learned": np.array([loop.matched_by == "learned" for loop in loops], np.bool_),
+        "loop_covariance": np.array(
+            [_UNKNOWN if loop.covariance is None else loop.covariance for loop in loops], np.float64
+        ).reshape(-1, 6, 6),
+        "revisit_landmark": resolve(map_.arrays, map_.revisits.landmark),
     }
+    for name in vars(map_.revisits):
+        arrays.setdefault(f"revisit_{name}", getattr(map_.revisits, name))
     for name in FrameTable._fields:
         arrays[f"frame_{name}"] = getattr(frames, name)
     if checkpoint is not None:

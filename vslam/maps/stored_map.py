@@ -22,8 +22,9 @@ from vslam.map import (
     KeyframeTable,
     Map,
     loop_of_living,
+    revisits_of_living,
 )
-from vslam.map_kernels import gather_observations
+from vslam.map_kernels import gather_observations, resolve
 from vslam.states import Checkpoint
 
 
@@ -179,6 +180,12 @@ def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> M
         for name in fields:
             columns[name] = renumbered[name] if name in renumbered else columns[name][chosen]
     result = map_.with_columns(columns)
+    new_landmark = np.full(map_.n_landmarks + 1, NONE, np.int32)  # the extra entry maps -1 to -1
+    new_landmark[landmarks] = np.arange(len(landmarks))
+    revisits = revisits_of_living(map_)
+    revisits = revisits.observing(new_landmark[resolve(a, revisits.landmark)])
+    revisits = replace(revisits, keyframe=new_id[revisits.keyframe])
+    result.revisits = revisits.select(np.flatnonzero(revisits.keyframe >= 0))
     result.scalars = replace(map_.scalars, calibrated_until=n - 1)
     return result
 
@@ -236,6 +243,7 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
     columns["parent"][n + np.flatnonzero(b.parents < 0)] = 0
     columns["restart"][n : n + 1] = UNPREDICTED
     both = a.with_columns(columns)
+    both.revisits = a.revisits.followed_by(b.revisits, n, a.n_landmarks)
     both.scalars = replace(
         a.scalars, session=drives + b.scalars.session, calibrated_until=both.n_keyframes - 1
     )

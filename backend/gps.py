@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from vslam.backend.pose_graph import (
     COVISIBLE,
     GAP,
+    ROTATION_FIRST,
     TREE,
     WEAK,
     PoseGraph,
@@ -436,10 +437,9 @@ def _factors(
     T_i_j[:, :3, 3] *= scale[edges].mean(axis=1)[:, None]
     sigmas = edge_sigmas(edges, T_i_j, graph.kind, seconds[edges], len(T_enu_k), config)
     sigmas[(graph.kind == TREE) | (graph.kind == COVISIBLE)] *= drift
-    sigmas[:, 0] = np.hypot(sigmas[:, 0], stretch * np.linalg.norm(T_i_j[:, :3, 3], axis=1))
-    for (i, j), T, sigma in zip(
-        edges.tolist(), T_i_j, np.repeat(sigmas[:, ::-1], 3, axis=1), strict=True
-    ):
+    stretched = stretch * np.linalg.norm(T_i_j[:, :3, 3], axis=1, keepdims=True)
+    sigmas[:, :3] = np.hypot(sigmas[:, :3], stretched)
+    for (i, j), T, sigma in zip(edges.tolist(), T_i_j, sigmas[:, ROTATION_FIRST], strict=True):
         between = noise.Diagonal.Sigmas(sigma)
         vision.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T), between))
     crowding = np.sqrt(positions.crowding)

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from vslam.config import PoseGraphConfig
 from vslam.geometry import compose, inverse, inverses, se3_log
 from vslam.kernels import kernel
-from vslam.loops import LoopEdge
+from vslam.loops import LoopEdge, reversed_loop
 from vslam.map import Map, loop_of_living
 from vslam.map_kernels import covisible_pairs
 
 TREE, COVISIBLE, WEAK, LOOP, GAP = range(5)  # kinds of edges, see ``essential_graph``
+ROTATION_FIRST = [3, 4, 5, 0, 1, 2]  # the order of GTSAM
 HOLD = 1e-6  # standard deviation of the prior that fixes a keyframe, m and rad
 
 
@@ -36,7 +37,8 @@ class PoseGraph:
         edges: ``(E, 2)`` int64 indices i, j into ``keyframes``.
         T_i_j: ``(E, 4, 4)`` measured pose of camera j in the frame of camera i.
         kind: ``(E,)`` uint8: TREE, COVISIBLE, WEAK, LOOP or GAP.
-        sigmas: ``(E, 2)`` standard deviations per axis of translation (m) and rotation (rad).
+        sigmas: ``(E, 6)`` standard deviations of the error of ``T_i_j``: of the translation (m) and
+            of the rotation (rad), for each axis of camera j.
         fixed: ``(N,)`` bool, True for keyframes that are held fixed: one in each connected part of
             the graph.
         scale: ``(E,)`` factor that converts lengths from the unit of length around keyframe j to
@@ -116,34 +118,33 @@ def essential_graph(
                 kind[pair] = TREE
             else:
                 kind[pair] = GAP if driven and not _spans(pair, unpredicted_restarts) else WEAK
-    measured: dict[tuple[int, int], tuple[NDArray[np.float64], float]] = {}
+    measured: dict[tuple[int, int], LoopEdge] = {}
     for loop in loops:
         found = loop_of_living(map_, loop)
-        query, match, scale = found.query, found.match, found.scale
-        assert found.T_query_match is not None
-        T = found.T_query_match
-        if query != match:
-            if query > match:
-                query, match, T, scale = match, query, inverse(T), 1.0 / scale
-            elif scale != 1.0:
-                T[:3, 3] *= scale
-            kind[query, match], measured[query, match] = LOOP, (T, scale)
+        if found.query != found.match:
+            found = found if found.query > found.match else reversed_loop(found)
+            kind[found.match, found.query] = LOOP
+            measured[found.match, found.query] = found
     edges = index[np.array(sorted(kind), np.int64).reshape(-1, 2)]
     kinds = np.array([kind[pair] for pair in sorted(kind)], np.uint8)
     T_i_j = T_cw[edges[:, 0]] @ inverses(T_cw)[edges[:, 1]]
     scales = np.ones(len(edges))
-    loop_edges = np.flatnonzero(kinds == LOOP)
-    for e in loop_edges.tolist():
-        i, j = living[edges[e]].tolist()
-        T_i_j[e], scales[e] = measured[i, j]
     seconds = map_.timestamps[living]
+    sigmas = edge_sigmas(edges, T_i_j, kinds, seconds[edges], len(living), config)
+    for e in np.flatnonzero(kinds == LOOP).tolist():
+        i, j = living[edges[e]].tolist()
+        loop = measured[i, j]
+        assert loop.T_query_match is not None
+        T_i_j[e], scales[e] = inverse(loop.T_query_match), 1.0 / loop.scale
+        if loop.covariance is not None:
+            sigmas[e] = np.sqrt(config.loop_inflation * np.diag(loop.covariance))
     return PoseGraph(
         keyframes=living,
         T_cw=T_cw,
         edges=edges,
         T_i_j=T_i_j,
         kind=kinds,
-        sigmas=edge_sigmas(edges, T_i_j, kinds, seconds[edges], len(living), config),
+        sigmas=sigmas,
         fixed=parts_of(edges, len(living)) == np.arange(len(living)),
         scale=scales,
     )
@@ -180,7 +181,7 @@ def edge_sigmas(
     n: int,
     config: PoseGraphConfig,
 ) -> NDArray[np.float64]:
-    """Compute the ``(E, 2)`` standard deviations of the edges: translation (m) and rotation (rad).
+    """Compute the ``(E, 6)`` standard deviations of the edges (``PoseGraph.sigmas``).
 
     Drift is modelled as a random walk, so the variance of a tree or covisibility edge grows with
     its length. All these edges are derived from the same measurement, the estimated path. If they
@@ -190,7 +191,8 @@ def edge_sigmas(
 
     For the translation of a GAP edge, two possible errors are compared: a fraction of the predicted
     distance, and the distance that a slow car travels in the elapsed time. The larger error is
-    used. A WEAK edge has very large standard deviations.
+    used. A WEAK edge has very large standard deviations. A LOOP edge has those of a loop whose
+    covariance is unknown.
 
     Args:
         seconds: ``(E, 2)`` timestamps of the ends of the edges.
@@ -211,7 +213,7 @@ def edge_sigmas(
     sigmas[gap, 1] = config.gap_rotation * np.maximum(elapsed, config.min_gap)
     sigmas[kind == WEAK] = config.weak_translation, config.weak_rotation
     sigmas[kind == LOOP] = config.loop_translation, config.loop_rotation
-    return sigmas
+    return np.repeat(sigmas, 3, axis=1)
 
 
 def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
@@ -250,7 +252,7 @@ def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
         graph,
         [gtsam.Pose3(T_wc) for T_wc in inverses(graph.T_cw)],
         [gtsam.Pose3(T_i_j) for T_i_j in graph.T_i_j],
-        np.repeat(graph.sigmas[:, ::-1], 3, axis=1),  # GTSAM: rotation first
+        graph.sigmas[:, ROTATION_FIRST],
         (gtsam.PriorFactorPose3, gtsam.BetweenFactorPose3),
         config,
     )
@@ -365,5 +367,5 @@ def edge_errors(T_cw, edges, T_i_j, sigmas):
         twist = se3_log(compose(inverse(T_i_j[e]), T))
         chi2[e] = 0.0
         for i in range(6):
-            chi2[e] += (twist[i] / sigmas[e, i // 3]) ** 2
+            chi2[e] += (twist[i] / sigmas[e, i]) ** 2
     return chi2

@@ -19,6 +19,7 @@ from vslam.backend.loop_correction import carry_landmarks_by
 from vslam.backend.pose_graph import (
     GAP,
     LOOP,
+    ROTATION_FIRST,
     WEAK,
     GraphCheck,
     PoseGraph,
@@ -27,7 +28,7 @@ from vslam.backend.pose_graph import (
 )
 from vslam.config import PoseGraphConfig
 from vslam.geometry import Matrix, inverses, se3_log
-from vslam.loops import LoopEdge
+from vslam.loops import LoopEdge, scaled_loop
 from vslam.map import Map
 from vslam.map_kernels import refresh_landmarks
 
@@ -84,11 +85,11 @@ def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfi
 def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     """Compute the ``(E, 7)`` standard deviations of the edges: rotation, translation, and the
     logarithm of the scale. The drift of the scale is modelled as a random walk along the path."""
-    scale = graph.sigmas[:, 1] * (config.scale_drift / config.rotation_drift)
+    scale = graph.sigmas[:, 3] * (config.scale_drift / config.rotation_drift)
     scale[graph.kind == LOOP] = config.loop_scale
     scale[graph.kind == WEAK] = config.weak_scale
     scale[graph.kind == GAP] = config.gap_scale
-    return np.column_stack([np.repeat(graph.sigmas[:, ::-1], 3, axis=1), scale])
+    return np.column_stack([graph.sigmas[:, ROTATION_FIRST], scale])
 
 
 def check_similarity_graph(
@@ -150,7 +151,6 @@ def loop_in_new_units(edge: LoopEdge, growth: NDArray[np.float64]) -> LoopEdge:
     """Convert a loop edge to the units of length after a correction of a monocular map. ``growth``
     is the factor by which the correction multiplied lengths around each keyframe."""
     assert edge.T_query_match is not None
-    T = edge.T_query_match.copy()
-    T[:3, 3] *= growth[edge.match]
+    scaled = scaled_loop(edge, float(growth[edge.match]))
     scale = edge.scale * float(growth[edge.query] / growth[edge.match])
-    return replace(edge, T_query_match=T, scale=scale)
+    return replace(scaled, scale=scale)

@@ -19,13 +19,12 @@ from vslam.datasets.synthetic import built_in_route
 from vslam.evaluation.odometry import motion_errors
 from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.pose import offset_effect, optimise_pose, pose_covariance
-from vslam.geometry import inverse, se3_exp, se3_log
+from vslam.geometry import adjoint, inverse, se3_exp, se3_log
 from vslam.odometry import (
     CORRELATION,
     DRIFT,
     Odometry,
     PoseUncertainty,
-    adjoint,
     predicted_covariance,
     relative_covariance,
 )

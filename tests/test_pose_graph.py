@@ -23,7 +23,7 @@ from vslam.backend.pose_graph import (
 from vslam.config import PoseGraphConfig
 from vslam.features import Features
 from vslam.geometry import inverse, inverses, orthonormalised, se3_exp, se3_log
-from vslam.loops import LoopEdge
+from vslam.loops import LoopEdge, reversed_loop
 from vslam.map import UNPREDICTED, Map
 from vslam.map_kernels import covisible_pairs, link_many
 
@@ -78,7 +78,7 @@ def test_translation_error_spreads_evenly():
     loop = inverse(T_wc[n - 1]) @ T_wc[0] @ translation(*missing)
     graph = chain_graph(T_wc, [(n - 1, 0)], [loop])
     # Rotation is fixed, so that it cannot absorb the error.
-    graph = replace(graph, sigmas=np.tile([0.1, 1e-6], (n, 1)))
+    graph = replace(graph, sigmas=np.tile(np.repeat([0.1, 1e-6], 3), (n, 1)))
     T_cw = optimise(graph, CONFIG.model_copy(update={"robust_scale": 1e6}))
     moved = inverses(T_cw)[:, :3, 3] - T_wc[:, :3, 3]
     np.testing.assert_allclose(moved, np.arange(n)[:, None] * -missing / n, atol=1e-6)
@@ -95,8 +95,8 @@ def test_rotation_error_spreads_by_the_variances(share):
     n, missing = 9, 0.3
     T_wc = np.array([turn(2 * np.pi * k / n) for k in range(n)])
     graph = chain_graph(T_wc, [(n - 1, 0)], [turn(2 * np.pi / n + missing)])
-    sigmas = np.full((n, 2), 0.05)
-    sigmas[3, 1] *= np.sqrt(share)
+    sigmas = np.full((n, 6), 0.05)
+    sigmas[3, 3:] *= np.sqrt(share)
     graph = replace(graph, sigmas=sigmas)
     T_cw = optimise(graph, CONFIG.model_copy(update={"robust_scale": 1e6}))
     yaw = [
@@ -115,12 +115,15 @@ def test_a_consistent_graph_stays_as_it_is():
     assert edge_errors(graph.T_cw, graph.edges, graph.T_i_j, graph.sigmas).max() < 1e-16
 
 
+SIGMAS = np.array([0.5, 0.4, 0.3, 0.1, 0.2, 0.05])
+
+
 def test_error_of_an_edge_is_the_whitened_twist():
     twist = np.array([0.3, -0.2, 0.1, 0.02, 0.01, -0.03])
     T_wc = np.array([turn(0.4), turn(0.4) @ translation(1, 2, 3)])
     T_i_j = inverse(T_wc[0]) @ T_wc[1] @ se3_exp(-twist)
-    chi2 = edge_errors(inverses(T_wc), np.array([[0, 1]]), T_i_j[None], np.array([[0.5, 0.1]]))
-    assert chi2[0] == pytest.approx((twist[:3] ** 2).sum() / 0.25 + (twist[3:] ** 2).sum() / 0.01)
+    chi2 = edge_errors(inverses(T_wc), np.array([[0, 1]]), T_i_j[None], SIGMAS[None])
+    assert chi2[0] == pytest.approx(((twist / SIGMAS) ** 2).sum())
 
 
 def test_redundant_edges_do_not_make_the_path_stiffer():
@@ -251,7 +254,34 @@ def test_the_loop_edge_wins_over_the_edge_of_the_same_keyframes():
         for pair, T in (((2, 4), T_covisible), ((5, 6), T_tree)):
             e = list(edges).index(pair)
             np.testing.assert_allclose(graph.T_i_j[e], T, atol=1e-15)
-            assert graph.sigmas[e].tolist() == [CONFIG.loop_translation, CONFIG.loop_rotation]
+            expected = np.repeat([CONFIG.loop_translation, CONFIG.loop_rotation], 3)
+            assert graph.sigmas[e].tolist() == expected.tolist()
+
+
+def test_a_loop_weighs_what_its_covariance_says():
+    """The covariance is converted if the ends of the edge are exchanged."""
+    map_ = line_map()
+    T = translation(0.3, 0, 1.5) @ turn(0.2)
+    axes = np.array([0.01, 0.02, 0.03, 0.001, 0.002, 0.003])
+    loop = replace(closed(4, 2, T), covariance=np.diag(axes**2))
+
+    def sigmas(loop):
+        graph = essential_graph(map_, [loop], CONFIG)
+        return graph.sigmas[int(np.flatnonzero(graph.kind == LOOP)[0])]
+
+    expected = np.sqrt(CONFIG.loop_inflation) * axes
+    np.testing.assert_allclose(sigmas(loop), expected)
+    np.testing.assert_allclose(sigmas(reversed_loop(loop)), expected, rtol=1e-6)
+    back = reversed_loop(reversed_loop(replace(loop, scale=1.3)))
+    np.testing.assert_allclose(back.covariance, loop.covariance, atol=1e-12)
+    np.testing.assert_allclose(back.T_query_match, T, atol=1e-12)
+    # exp(xi) T is the true pose. The errors of the reversed edge have the reversed covariance.
+    rng = np.random.default_rng(0)
+    errors = [
+        se3_log(inverse(se3_exp(xi) @ T) @ T) for xi in 0.1 * axes * rng.normal(size=(4000, 6))
+    ]
+    spread = np.cov(np.array(errors).T) / 0.01
+    np.testing.assert_allclose(np.diag(spread), np.diag(reversed_loop(loop).covariance), rtol=0.15)
 
 
 def test_a_drifted_covisibility_edge_would_hold_the_drift():
@@ -302,7 +332,8 @@ def test_edges_past_a_restart_are_weak():
     assert edges[3, 5] == WEAK
     assert list(edges.values()).count(WEAK) == 1
     e = list(edges).index((3, 5))
-    assert graph.sigmas[e].tolist() == [CONFIG.weak_translation, CONFIG.weak_rotation]
+    weak = np.repeat([CONFIG.weak_translation, CONFIG.weak_rotation], 3)
+    assert graph.sigmas[e].tolist() == weak.tolist()
     # The camera moved on by 2 m in the gap. The sigmas grow with this distance and with time.
     graph = essential_graph(map_, [], CONFIG, driven=True)
     assert named(graph)[3, 5] == GAP
@@ -312,7 +343,7 @@ def test_edges_past_a_restart_are_weak():
         max(CONFIG.gap_translation * 2.0, CONFIG.gap_speed * elapsed),
         CONFIG.gap_rotation * max(elapsed, CONFIG.min_gap),
     ]
-    assert graph.sigmas[e].tolist() == pytest.approx(expected)
+    assert graph.sigmas[e].tolist() == pytest.approx(np.repeat(expected, 3).tolist())
     # There is no such edge if the speed was unknown.
     map_.keyframes.restart[4] = UNPREDICTED
     graph = essential_graph(map_, [], CONFIG, driven=True)

@@ -18,7 +18,7 @@ from vslam.datasets.masks import with_masks
 from vslam.datasets.rectified import rectified
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import TrackingState
-from vslam.odometry import adjoint
+from vslam.geometry import adjoint
 from vslam.run.gps import locate
 from vslam.run.outcome import RunOutcome, causal_trajectory, odometry_trajectory
 from vslam.slam import Slam

@@ -681,10 +681,15 @@ class PoseGraphConfig(Section):
     per square root of a map unit. [own]"""
     min_length: float = Field(0.3, gt=0)
     """An edge shorter than this counts as this long in the drift model, in metres. [own]"""
+    loop_inflation: float = Field(1.5, gt=0)
+    """Factor that multiplies the computed covariance of a verified loop, which does not contain the
+    errors of the landmarks (docs/research/uncertainty.md). [own]"""
     loop_translation: float = Field(0.1, gt=0)
-    """Standard deviation of the translation of a verified loop, in metres. [own]"""
+    """Standard deviation of the translation of a loop whose covariance is unknown, in metres.
+    [own]"""
     loop_rotation: float = Field(0.005, gt=0)
-    """Standard deviation of the rotation of a verified loop, in radians. [own]"""
+    """Standard deviation of the rotation of a loop whose covariance is unknown, in radians.
+    [own]"""
     loop_scale: float = Field(0.02, gt=0)
     """Standard deviation of the logarithm of the scale of a verified loop. [own]"""
     weak_scale: float = Field(3.0, gt=0)

@@ -213,3 +213,15 @@ def inverses(T_a_b: Matrix) -> Matrix:
     T_b_a[:, :3, 3] = -np.einsum("nij,nj->ni", T_b_a[:, :3, :3], T_a_b[:, :3, 3])
     T_b_a[:, 3, 3] = 1.0
     return T_b_a
+
+
+def adjoint(T: Matrix) -> Matrix:
+    """Return the ``(6, 6)`` adjoint matrix of a motion, for twists ``xi = [v, w]``.
+
+    It satisfies ``T exp(xi) = exp(adjoint(T) xi) T``.
+    """
+    R, t = T[:3, :3], T[:3, 3]
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = R
+    A[:3, 3:] = np.cross(t, R, axisb=0, axisc=0)
+    return A

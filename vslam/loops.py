@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from vslam.geometry import adjoint, inverse
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,39 @@ class LoopEdge:
             matched_by=matched_by,
             proposed_by=candidate.proposed_by,
         )
+
+
+def scaled_loop(loop: LoopEdge, factor: float) -> LoopEdge:
+    """Convert the relative pose of a loop to another unit of length.
+
+    Args:
+        factor: number of new units per old unit.
+    """
+    assert loop.T_query_match is not None
+    T, units = loop.T_query_match.copy(), np.repeat([factor, 1.0], 3)
+    T[:3, 3] *= factor
+    covariance = None if loop.covariance is None else loop.covariance * np.outer(units, units)
+    return replace(loop, T_query_match=T, covariance=covariance)
+
+
+def reversed_loop(loop: LoopEdge) -> LoopEdge:
+    """Exchange the query and the match of a loop, without its features and landmarks."""
+    loop = scaled_loop(loop, loop.scale)  # to the unit around the query
+    assert loop.T_query_match is not None
+    T_match_query, covariance = inverse(loop.T_query_match), loop.covariance
+    if covariance is not None:
+        A = adjoint(T_match_query)
+        covariance = A @ covariance @ A.T
+    return replace(
+        loop,
+        query=loop.match,
+        match=loop.query,
+        T_query_match=T_match_query,
+        covariance=covariance,
+        scale=1.0 / loop.scale,
+        features=None,
+        landmarks=None,
+    )
 
 
 def loop_entry(loop: LoopEdge) -> dict[str, Any]:

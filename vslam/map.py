@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.features import Features
-from vslam.geometry import compose, inverse, orthonormalised
+from vslam.geometry import adjoint, compose, inverse, orthonormalised
 from vslam.loops import LoopEdge
 from vslam.map_kernels import count_shared, detach_keyframe, resolve
 from vslam.revisits import Revisits
@@ -452,15 +452,20 @@ def loop_of_living(map_: Map, loop: LoopEdge) -> LoopEdge:
     if loop.T_query_match is None:
         raise ValueError(f"The loop from keyframe {loop.query} to {loop.match} has no pose.")
     query, match, T = loop.query, loop.match, loop.T_query_match
+    covariance = loop.covariance
     if not map_.arrays.keyframe_alive[query]:
         T_parent_query = inverse(map_.keyframes.T_c_parent[query])
         T_parent_query[:3, 3] /= loop.scale  # convert to the unit of the match
         T = compose(T_parent_query, T)
+        if covariance is not None:
+            A = adjoint(T_parent_query)
+            covariance = A @ covariance @ A.T
         query = int(map_.parents[query])
     if not map_.arrays.keyframe_alive[match]:
         T = compose(T, map_.keyframes.T_c_parent[match])
         match = int(map_.parents[match])
-    return replace(loop, query=query, match=match, T_query_match=orthonormalised(T))
+    T = orthonormalised(T)
+    return replace(loop, query=query, match=match, T_query_match=T, covariance=covariance)
 
 
 def revisits_of_living(map_: Map) -> Revisits:

@@ -33,7 +33,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.geometry import Matrix, inverse, orthonormalised, se3_exp, se3_log
+from vslam.geometry import Matrix, adjoint, inverse, orthonormalised, se3_exp, se3_log
 
 # DRIFT multiplies the computed covariance of the drift. CORRELATION is the correlation of
 # consecutive steps of the drift. Both were tuned on three rendered drives so that the squared
@@ -157,18 +157,6 @@ def _predicted(
         distance = speed * time + 0.5 * ACCELERATION * time**2
         variances.append(np.repeat(np.square([distance, angle]), 3))
     return _symmetric(A @ covariance @ A.T) + np.diag(variances[1] - variances[0])
-
-
-def adjoint(T: Matrix) -> Matrix:
-    """Return the ``(6, 6)`` adjoint matrix of a motion, for twists ``xi = [v, w]``.
-
-    It satisfies ``T exp(xi) = exp(adjoint(T) xi) T``.
-    """
-    R, t = T[:3, :3], T[:3, 3]
-    A = np.zeros((6, 6))
-    A[:3, :3] = A[3:, 3:] = R
-    A[:3, 3:] = np.cross(t, R, axisb=0, axisc=0)
-    return A
 
 
 def _symmetric(matrix: Matrix) -> Matrix:

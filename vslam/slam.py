@@ -24,7 +24,7 @@ from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Found, Tracker, TrackerStatus, result_of
 from vslam.frontend.tracking import TrackingContext, uncertainty_of
 from vslam.gaps import Gap, find_gaps
-from vslam.geometry import Matrix, inverse
+from vslam.geometry import Matrix, adjoint, inverse
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_verification import LearnedRelocalisation
 from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
@@ -38,7 +38,7 @@ from vslam.mapping import Mapper
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.modes import MapBuilding, Mode
-from vslam.odometry import Odometry, adjoint
+from vslam.odometry import Odometry
 from vslam.session import Session, open_map
 from vslam.trajectory import Trajectory
 from vslam.workers import Workers

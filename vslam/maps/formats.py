@@ -92,7 +92,7 @@ def save_g2o(
         T_wc: ``(N, 4, 4)`` poses of the vertices.
         edges: ``(E, 2)`` indices of the two vertices i and j of each edge, in ``ids``.
         T_i_j: ``(E, 4, 4)`` measured pose of j in the frame of i.
-        sigmas: ``(E, 2)`` standard deviations of the translation (m) and of the rotation (rad), for
+        sigmas: ``(E, 6)`` standard deviations of the translation (m) and of the rotation (rad), for
             each axis.
 
     Raises:
@@ -102,7 +102,7 @@ def save_g2o(
         f"VERTEX_SE3:QUAT {vertex} {_words(values)}\n"
         for vertex, values in zip(ids.tolist(), _poses(T_wc).tolist(), strict=True)
     ]
-    information = 1.0 / np.repeat(sigmas, 3, axis=1) ** 2
+    information = 1.0 / sigmas**2
     upper = np.triu_indices(6)
     for ends, values, diagonal in zip(
         ids[edges].tolist(), _poses(T_i_j).tolist(), information, strict=True

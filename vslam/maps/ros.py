@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from vslam.errors import InputError
 from vslam.features import TrackResult
-from vslam.geometry import Matrix, inverse, inverses, se3_log
-from vslam.odometry import adjoint
+from vslam.geometry import Matrix, adjoint, inverse, inverses, se3_log
 from vslam.trajectory import Trajectory, quaternions
 
 MAP, ODOM, BASE, OPTICAL = "map", "odom", "base_link", "camera_optical"

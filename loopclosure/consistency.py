@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.config import ConsistencyConfig, VerificationConfig
-from vslam.geometry import inverse, se3_log
+from vslam.geometry import inverse, se3_log, transform
 from vslam.loopclosure.verification import verify_near
 from vslam.loops import LoopCandidate, LoopEdge, ResembledPlace
 from vslam.map import Map
@@ -131,12 +131,15 @@ class LoopConsistency:
         self, edge: LoopEdge, map_: Map, camera: Camera, config: VerificationConfig
     ) -> bool:
         assert edge.T_query_match is not None
+        assert edge.landmarks is not None
+        T_query_w = edge.T_query_match @ map_.keyframe_pose(edge.match)
+        depth = float(np.median(transform(T_query_w, map_.arrays.xyz[edge.landmarks])[:, 2]))
         T_w_query = inverse(map_.keyframe_pose(edge.query))
         for keyframe in map_.covisible(edge.query)[0].tolist():
             T_keyframe_query = map_.keyframe_pose(keyframe) @ T_w_query
-            if np.linalg.norm(T_keyframe_query[:3, 3]) < self.config.min_moved:
+            T_keyframe_query[:3, 3] /= edge.scale  # to the unit around the match
+            if np.linalg.norm(T_keyframe_query[:3, 3]) < self.config.min_moved * depth:
                 continue
-            T_keyframe_query[:3, 3] /= edge.scale
             expected = replace(
                 edge, query=keyframe, T_query_match=T_keyframe_query @ edge.T_query_match
             )

@@ -152,7 +152,7 @@ def test_a_drive_that_ends_before_the_next_keyframe_asks_an_earlier_one():
 
 @pytest.mark.slow
 def test_a_loop_that_no_earlier_keyframe_far_enough_away_confirms_stays_open():
-    config = Config(consistency=ConsistencyConfig(min_moved=20.0))
+    config = Config(consistency=ConsistencyConfig(min_moved=2.0))
     slam, _ = run(ZOOMING, ENDS_EARLY, Oracle(ZOOMING, ENDS_EARLY), config=config)
     assert slam.loops[-1].reason == "verified by 1 of 2 keyframes"
     assert not slam.corrections

@@ -564,10 +564,10 @@ class ConsistencyConfig(Section):
     max_turn: float = Field(1.0, gt=0)
     """Two loops agree only if the orientations of the query that they imply differ by at most this
     value, in degrees. [own]"""
-    min_moved: float = Field(2.0, ge=0)
-    """At the end of a drive, an earlier keyframe may confirm a loop only if it is at least this far
-    from the query, in metres. A nearer keyframe would only repeat the evidence of the query.
-    [own]"""
+    min_moved: float = Field(0.15, ge=0)
+    """At the end of a drive, an earlier keyframe may confirm a loop only if its distance from the
+    query is at least this fraction of the median depth of the matched landmarks. A nearer keyframe
+    would only repeat the evidence of the query. [own]"""
 
 
 class RelocalizationConfig(Section):

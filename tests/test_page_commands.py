@@ -267,7 +267,21 @@ RULES = {
         (("--laws all --detectors bow --steps 4", "--laws night --seeds 1 --steps 1"),),
         (("vslam stress --dataset synthetic --seqs demo --laws", HOURS),),
     ),
-    "docs/research/training.md": Rules(),
+    "docs/research/training.md": Rules(
+        not_run=(
+            ("vslam synth", AGAIN),
+            ("with ", "it writes settings for the trainings below"),
+            ("with()", "as above"),
+            ("python - ", "as above"),
+            ("kitti=", HOURS),
+            ("photos=", HOURS),
+            ("towns=", HOURS),
+            ("learn", HOURS),
+            ("for name in control", HOURS),
+            ("(head -n 1 bench/control", "it needs the results of these trainings"),
+            ("(echo training", "as above"),
+        )
+    ),
     "docs/howto/training.md": Rules(
         (
             (r'--data "kitti:[^"]*" ', ""),

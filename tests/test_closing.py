@@ -12,7 +12,7 @@ from ring import CAMERA, LAP, Oracle, Ring
 
 from vslam.backend.pose_graph import GAP, WEAK, connectivity
 from vslam.closing import LoopClosing
-from vslam.config import Config, ConsistencyConfig, KeyframeConfig, PoseGraphConfig
+from vslam.config import Config, ConsistencyConfig, KeyframeConfig, LoopConfig, PoseGraphConfig
 from vslam.features import Extracted, Features, TrackingState
 from vslam.geometry import inverse
 from vslam.hypotheses import Hypothesis, joined_submaps, solve
@@ -414,6 +414,30 @@ def test_loop_closing_restored_from_its_state_closes_the_loop_that_waits():
         closing.consider(map_, last, candidates)
     assert not fresh.corrections
     assert len(restored.corrections) == 1
+
+
+def test_the_map_is_adjusted_again_after_enough_revisits():
+    map_ = copy.deepcopy(open_loop("carried")[0])
+    n = len(map_.living_keyframes())
+    config = Config(loops=LoopConfig(min_revisits=3, revisits_share=5.5 / n))
+
+    def closing() -> LoopClosing:
+        return LoopClosing(NoDetector(), Verifier(config, CAMERA), CAMERA, config, threads=1)
+
+    leaving, staying = closing(), closing()
+    for count in (1, 2, 3):
+        leaving.count_revisit(map_)
+        assert not leaving.is_adjusting  # the camera is still at old places
+        leaving.adjust_after_revisits(map_)
+        assert leaving.is_adjusting == (count == 3)
+    for count in range(1, 7):
+        staying.count_reused_keyframe(map_, new=True)
+        staying.count_reused_keyframe(map_, new=False)
+        assert staying.is_adjusting == (count == 6)
+    before = map_.arrays.T_cw[: map_.n_keyframes].copy()
+    leaving.conclude(map_)
+    assert not leaving.is_adjusting
+    assert not np.array_equal(map_.arrays.T_cw[: map_.n_keyframes], before)
 
 
 def test_where_no_speed_was_known_a_restart_is_unpredicted():

@@ -72,6 +72,9 @@ class Closing:
         assert new
         return self.is_due
 
+    def count_revisit(self, map_: Map) -> None:
+        pass
+
     def adjust_after_revisits(self, map_: Map) -> None:
         pass
 

@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 from test_global_mapping import pose, world_of
-from test_local_mapping import CAMERA
+from test_local_mapping import CAMERA, make_world
 
 from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.global_mapping import merge_solution, take_snapshot
 from vslam.geometry import inverse, se3_exp
 from vslam.map import revisits_of_living
+from vslam.map_frames import sees_old_place
+from vslam.map_kernels import link_many
 from vslam.maps.stored_map import StoredMap, appended, selected
 from vslam.revisits import Revisits
 
@@ -131,3 +133,22 @@ def test_parts_and_sums_of_maps_keep_their_revisits():
     np.testing.assert_array_equal(
         both.revisits.landmark[len(one.map.revisits.landmark) :], one.map.revisits.landmark + n
     )
+
+
+def test_a_keyframe_returns_to_an_old_place_if_it_skips_a_stretch():
+    """Keyframes 0 to 19 each share their landmarks with the next two. The last sees the first."""
+    world = make_world(400)
+    groups = np.array_split(np.arange(400), 20)
+    for k in range(20):
+        world.add_keyframe(np.eye(4), among=np.concatenate(groups[max(0, k - 2) : k + 1]))
+    world.link_truth(range(20))
+    assert not any(sees_old_place(world.map, k, 5) for k in range(20))
+    back = world.add_keyframe(np.eye(4), among=np.concatenate([groups[19], groups[3]]))
+    rows = np.arange(world.map.rows(back).start, world.map.n_rows)
+    landmark_of = {
+        int(world.point_of_row[row]): int(world.map.arrays.landmark[row]) for row in range(rows[0])
+    }
+    seen = np.array([landmark_of[int(point)] for point in world.point_of_row[rows]], np.int32)
+    link_many(world.map.arrays, rows, seen)
+    assert sees_old_place(world.map, back, 5)
+    assert not sees_old_place(world.map, back, 30)

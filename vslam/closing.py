@@ -150,8 +150,7 @@ class LoopClosing:
         """Record that an old keyframe became the reference keyframe instead of a new keyframe.
 
         The result of the global bundle adjustment is merged after a certain number of keyframes. A
-        reused keyframe also counts towards this number. If many places have been revisited since
-        the last adjustment, another adjustment begins.
+        reused keyframe also counts towards this number.
 
         Args:
             new: whether the map has a new revisit.
@@ -160,11 +159,17 @@ class LoopClosing:
             Whether the result of the global bundle adjustment must be merged now.
         """
         self._followed += 1
-        self._new_revisits += new
+        if new:
+            self.count_revisit(map_)
+        return self._is_due(map_.n_keyframes - 1)
+
+    def count_revisit(self, map_: Map) -> None:
+        """Record that a frame has measured an old place again. If there have been many such frames
+        since the last global bundle adjustment began, another adjustment begins."""
+        self._new_revisits += 1
         enough = self._config.loops.revisits_share * len(map_.living_keyframes())
         if self._new_revisits >= enough:
             self.adjust_after_revisits(map_)
-        return self._is_due(map_.n_keyframes - 1)
 
     def adjust_after_revisits(self, map_: Map) -> None:
         """Start a global bundle adjustment if places were revisited since the last one began.

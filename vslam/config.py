@@ -622,11 +622,12 @@ class LoopConfig(Section):
     keyframes after its loop, where n is the number of observations. With a smaller value, mapping
     waits for the result less often. [own]"""
     min_revisits: int = Field(5, ge=1)
-    """Where the camera revisits a known place, the map is adjusted again after at least this many
-    revisits: when the camera leaves known places, and at the end of the drive. [own]"""
-    revisits_share: float = Field(0.05, ge=0)
-    """While the camera stays at known places, the map is adjusted again when the number of new
-    revisits reaches this fraction of the number of keyframes. [own]"""
+    """The map is adjusted again when the camera leaves old places and at the end of the drive, if
+    at least this many frames have measured old places since the last adjustment. These frames are
+    new keyframes that observe an old place, and frames whose reference is an old keyframe. [own]"""
+    revisits_share: float = Field(0.1, ge=0)
+    """While the camera stays at old places, the map is adjusted again when the number of these
+    frames reaches this fraction of the number of keyframes. [own]"""
 
 
 class BowConfig(Section):

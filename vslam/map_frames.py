@@ -29,6 +29,8 @@ from vslam.revisits import Revisits
 from vslam.starter import TwoViewStart
 from vslam.trajectory import Trajectory
 
+_STRETCH = 10  # keyframes of a stretch after which a place is old
+
 
 def add_frame(
     map_: Map, frame: Frame, certainty: NDArray[np.uint8] | int, reference: int, *, predicted: bool
@@ -184,6 +186,20 @@ def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | 
     if shared[best] == 0:
         return None
     return OldPlace(best, int(shared[best]), count_seen_by(map_.arrays, best, 3))
+
+
+def sees_old_place(map_: Map, keyframe: int, min_shared: int) -> bool:
+    """Return whether a new keyframe has returned to an old place.
+
+    The keyframe then shares landmarks with keyframes before and after a stretch of the drive, but
+    not with the keyframes of this stretch.
+
+    Args:
+        min_shared: two keyframes show the same place if they share this many landmarks.
+    """
+    seen = np.sort(map_.covisible(keyframe, min_shared)[0])
+    number = np.searchsorted(map_.living_keyframes(), [*seen, keyframe])
+    return bool((np.diff(number) > _STRETCH).any())
 
 
 def add_revisit(map_: Map, keyframe: int, frame: Frame, certainty: NDArray[np.uint8] | int) -> bool:

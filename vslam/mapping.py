@@ -48,6 +48,7 @@ from vslam.map_frames import (
     find_old_place,
     has_more_points,
     observe_keyframe,
+    sees_old_place,
     update_landmarks,
 )
 from vslam.map_view import MapView, local_map, view_of
@@ -287,11 +288,14 @@ class Mapper:
         """
         with self._changing() as map_:
             self._make_room(map_, frame)
-            self._closing.adjust_after_revisits(map_)
             certainty = certainty_of(frame, self._config.alignment)
             keyframe = add_frame(map_, frame, certainty, self.reference, predicted=predicted)
             map_stereo_points(map_, keyframe, self._camera, self._config)
             refresh_keyframe(map_, keyframe)
+            if sees_old_place(map_, keyframe, self._config.mapping.min_shared):
+                self._closing.count_revisit(map_)
+            else:
+                self._closing.adjust_after_revisits(map_)
             self._set_newest(keyframe, frame)
             self.frames.replace(frame.index, keyframe)
             if keyframe > 0:

@@ -26,6 +26,7 @@ from vslam.map_frames import add_revisit
 from vslam.map_kernels import erase_landmark
 from vslam.map_view import MapView
 from vslam.mapping import Mapper
+from vslam.revisits import MAX_REVISITS
 from vslam.slam import Slam
 from vslam.starter import TwoViewStart
 from vslam.states import MapperState
@@ -526,7 +527,7 @@ def test_a_place_is_old_when_its_keyframe_is(known_after_s, known):
         assert place.n_place == 0  # only two keyframes see anything
 
 
-def test_what_is_seen_at_a_known_place_is_kept_once():
+def test_what_is_seen_at_a_known_place_is_kept_a_few_times():
     drive = Drive(known_after_s=0.3)
     drive.steps([0, 3], 6)
     mapper, frame = drive.mapper, drive.last
@@ -536,8 +537,9 @@ def test_what_is_seen_at_a_known_place_is_kept_once():
     np.testing.assert_array_equal(revisits.landmark, frame.landmark[frame.landmark >= 0])
     T_cw = revisits.T_c_keyframe[0] @ mapper.map.keyframe_pose(0)
     np.testing.assert_allclose(T_cw, frame.T_cw, atol=1e-12)
-    assert not add_revisit(mapper.map, 0, frame, 1)
-    assert len(mapper.map.revisits) == 1
+    kept = [add_revisit(mapper.map, 0, frame, 1) for _ in range(2 * MAX_REVISITS)]
+    assert kept == [True] * (MAX_REVISITS - 1) + [False] * (MAX_REVISITS + 1)
+    assert len(mapper.map.revisits) == MAX_REVISITS
 
 
 @pytest.mark.parametrize("is_due", [False, True])

@@ -25,7 +25,7 @@ from vslam.map_kernels import (
     resolve,
 )
 from vslam.reprojection import stack_uvr
-from vslam.revisits import Revisits
+from vslam.revisits import MAX_REVISITS, Revisits
 from vslam.starter import TwoViewStart
 from vslam.trajectory import Trajectory
 
@@ -203,7 +203,7 @@ def sees_old_place(map_: Map, keyframe: int, min_shared: int) -> bool:
 
 
 def add_revisit(map_: Map, keyframe: int, frame: Frame, certainty: NDArray[np.uint8] | int) -> bool:
-    """Keep what a frame at a known place observes, unless there is a revisit for this place.
+    """Keep what a frame at a known place observes, unless there are enough revisits of this place.
 
     Args:
         keyframe: the old keyframe that becomes the reference keyframe of the frame.
@@ -212,7 +212,7 @@ def add_revisit(map_: Map, keyframe: int, frame: Frame, certainty: NDArray[np.ui
     Returns:
         Whether the observations were kept.
     """
-    if keyframe in map_.revisits.keyframe:
+    if np.count_nonzero(map_.revisits.keyframe == keyframe) >= MAX_REVISITS:
         return False
     features = frame.refined_features()
     tracked = np.flatnonzero(frame.landmark >= 0)

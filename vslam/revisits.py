@@ -5,8 +5,8 @@ At a known place, an old keyframe becomes the reference keyframe, and no keyfram
 (``backend/global_mapping.py``). In contrast to a keyframe, it has only the features that observe
 landmarks, and no descriptors. It is neither tracked nor searched for loops.
 
-There is at most one revisit for each keyframe. The map therefore stays as small as it is, however
-often the camera returns.
+There are at most four revisits for each keyframe. The map therefore stays small, however often the
+camera returns.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from vslam.geometry import Matrix, orthonormalised
 from vslam.loops import ranges
+
+MAX_REVISITS = 4  # of a keyframe; a revisit takes about a twentieth of the memory of a keyframe
 
 
 @dataclass(frozen=True)

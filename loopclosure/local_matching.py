@@ -9,7 +9,7 @@ reverse search, from the second to the first image, returns to the keypoint.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ from vslam.kernels import inner_kernel, kernel
 COARSE_STRIDE, FINE_STRIDE = 16, 4  # pixels of the network's input per cell
 _HOMOGRAPHY_PIXELS = 12.0  # RANSAC threshold, pixels of the network's input
 _HOMOGRAPHY_DRAWS = 300  # maximum number of RANSAC samples
+# The same for fine matches, which are more accurate and have more outliers.
+_FINE_HOMOGRAPHY_PIXELS, _FINE_HOMOGRAPHY_DRAWS = 6.0, 1000
 
 
 class DescriptorMaps(NamedTuple):
@@ -155,15 +157,57 @@ def homography_inliers(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMa
     deviate from it by only a cell or two. In images of different places, far fewer matches fit a
     common homography.
     """
+    _, inlier = _fit_homography(
+        a.scale * positions(coarse.a, a), b.scale * positions(coarse.b, b),
+        _HOMOGRAPHY_PIXELS, _HOMOGRAPHY_DRAWS,
+    )  # fmt: skip
+    return int(inlier.sum())
+
+
+def fine_agreement(
+    xy: NDArray[np.float32],
+    a: DescriptorMaps,
+    b: DescriptorMaps,
+    coarse: CoarseMatches,
+    reach: int,
+    least: float,
+) -> float:
+    """Compute the share of the fine matches in the overlap of two images that fit a homography.
+
+    The homography is fitted to the fine matches alone. A fine match lies in the overlap if the
+    homography maps its keypoint into image b. Cells of sky or of a repeated facade may match
+    coarsely in images of different places, but their keypoints then disagree.
+
+    Args:
+        xy, reach, least: as for ``locate``.
+        coarse: coarse matches from a to b.
+
+    Returns:
+        The share, from 0 to 1. It is 0 if no homography is found.
+    """
+    located = locate(xy, a, b, coarse, reach, least)
+    seen_a, seen_b = a.scale * xy[located.found], b.scale * located.xy[located.found]
+    H, inlier = _fit_homography(seen_a, seen_b, _FINE_HOMOGRAPHY_PIXELS, _FINE_HOMOGRAPHY_DRAWS)
+    if H is None:
+        return 0.0
+    mapped = np.column_stack([seen_a, np.ones(len(seen_a))]) @ H.T
+    mapped = mapped[:, :2] / mapped[:, 2:]
+    rows, columns, _ = b.fine.shape
+    overlap = ((mapped >= 0) & (mapped < [FINE_STRIDE * columns, FINE_STRIDE * rows])).all(1)
+    # Any four matches fit a homography, so four of the inliers prove nothing.
+    return max(0.0, float((inlier.sum() - 4) / (overlap | inlier).sum()))
+
+
+def _fit_homography(
+    a: NDArray[Any], b: NDArray[Any], pixels: float, draws: int
+) -> tuple[NDArray[Any] | None, NDArray[np.bool_]]:
     import cv2
 
-    if len(coarse.a) < 4:
-        return 0
-    _, inlier = cv2.findHomography(
-        a.scale * positions(coarse.a, a), b.scale * positions(coarse.b, b),
-        cv2.RANSAC, _HOMOGRAPHY_PIXELS, maxIters=_HOMOGRAPHY_DRAWS,
-    )  # fmt: skip
-    return 0 if inlier is None else int(inlier.sum())
+    none = np.zeros(len(a), np.bool_)
+    if len(a) < 4:
+        return None, none
+    H, inlier = cv2.findHomography(a, b, cv2.RANSAC, pixels, maxIters=draws)
+    return H, none if inlier is None else inlier[:, 0].astype(np.bool_)
 
 
 def _fewest_cells(a: DescriptorMaps, b: DescriptorMaps) -> int:

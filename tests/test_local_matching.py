@@ -9,6 +9,8 @@ import pytest
 from vslam.loopclosure.local_matching import (
     CoarseMatches,
     DescriptorMaps,
+    fine_agreement,
+    homography_inliers,
     locate,
     locate_near,
     match_coarse,
@@ -102,3 +104,22 @@ def test_a_point_must_lead_back():
     assert locate_near(place, expected, a, b, 2, 0.3).found.tolist() == [True, True]
     # If the window contains both places, only the true one is matched in both directions.
     assert locate_near(place, expected, a, b, 5, 0.3).found.tolist() == [True, False]
+
+
+def test_fine_matches_confirm_a_scene_seen_again_and_not_one_that_is_alike_in_part_or_coarsely():
+    pixels, other = field(6), field(7)
+    keypoints = np.random.default_rng(0).uniform([40, 20], [560, 170], (400, 2)).astype(np.float32)
+    a, again, another = (maps(one) for one in (pixels, moved(pixels, 32.0, 5.0), other))
+    part = pixels.copy()
+    part[:, 120:] = other[:, 120:]
+
+    def agreement(b: DescriptorMaps, guides: DescriptorMaps) -> float:
+        return fine_agreement(keypoints, a, b, match_coarse(a, guides, 0.3), 5, 0.5)
+
+    assert agreement(again, again) > 0.9
+    assert 0.1 < agreement(maps(part), maps(part)) < 0.6
+    # The coarse cells agree everywhere, as in another town with the same facades.
+    alike = another._replace(coarse=again.coarse)
+    assert homography_inliers(match_coarse(a, alike, 0.5), a, alike) > 300
+    assert agreement(alike, alike) < 0.3
+    assert fine_agreement(keypoints[:2], a, again, match_coarse(a, again, 0.3), 5, 0.5) == 0.0

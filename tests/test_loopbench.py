@@ -27,7 +27,9 @@ from vslam.lab.loopbench.cost import cost
 from vslam.lab.loopbench.detectors import BowScorer, DetectorSet, LocalDescriptorCache, describe
 from vslam.lab.loopbench.measure import (
     LENGTH,
+    MIN_CONFIRMED,
     TOP,
+    confirmed_cells,
     epipolar_inliers,
     log_odds,
     measure,
@@ -290,6 +292,28 @@ def test_local_descriptors_are_kept_as_long_as_their_image(vocabulary):
     assert freed() is None
 
 
+def test_fine_local_descriptors_are_kept_for_the_last_few_images_only(vocabulary):
+    local = LocalDescriptorCache()
+    images = describe([texture(k)[:64, :64] for k in range(9)], vocabulary, 1)
+    first = local.with_fine(images[0])
+    assert first.fine.shape[:2] == (160, 160)
+    assert local.with_fine(images[0]) is first
+    for image in images[1:]:
+        local.with_fine(image)
+    assert local.with_fine(images[8]) is local.with_fine(images[8])
+    assert local.with_fine(images[0]) is not first
+
+
+def test_matching_cells_count_little_if_the_keypoints_disagree(vocabulary):
+    images = describe([texture(0), texture(1)], vocabulary, 1)
+    local = LocalDescriptorCache()
+    seen_again = confirmed_cells(images[0], images[0], local)
+    assert seen_again > 2 * MIN_CONFIRMED
+    told = LocalDescriptorCache()
+    told.of = lambda image: local.of(images[0])  # all cells of all images match
+    assert confirmed_cells(images[0], images[1], told) < seen_again / 5
+
+
 def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):
     images = [texture(k) for k in range(4)]
     relation = (2 * np.eye(4) - 1).astype(np.int8)
@@ -366,7 +390,7 @@ def test_cost_is_measured_in_a_process_of_its_own():
 
 
 def test_tests_of_images_are_compared_on_photographs(tmp_path, monkeypatch, capsys):
-    for place in range(3):
+    for place in range(4):
         whole = texture(place, 480, 800)
         folder = tmp_path / "landmarks" / str(place)
         folder.mkdir(parents=True)
@@ -375,5 +399,6 @@ def test_tests_of_images_are_compared_on_photographs(tmp_path, monkeypatch, caps
     script = Path(__file__).parents[1] / "tools/experiments/local_descriptors/image_test.py"
     monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path), "landmarks"])
     runpy.run_path(str(script), run_name="__main__")
-    row = capsys.readouterr().out.splitlines()[-1]
-    assert row == "| landmarks | 6 | 100.0 %, 100.0 % | 12 | 0.0 %, 0.0 % |"
+    assert capsys.readouterr().out.splitlines()[2:] == [
+        f"| landmarks | {half} | 4 | 4, 4, 4 | 8 | 0, 0, 0 |" for half in ("tuning", "test")
+    ]

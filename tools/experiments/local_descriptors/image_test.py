@@ -1,19 +1,24 @@
-"""Compare two tests that decide whether two photographs show the same place.
+"""Compare tests that decide whether two photographs show the same place.
 
     python tools/experiments/local_descriptors/image_test.py PHOTOS multiview webcams
 
-PHOTOS is a folder of sets of photographs, with the images in SET/PLACE/. Every image is a query.
-Each query is paired with a right image and with two wrong images. Similarities are computed using
-the capsule network.
+PHOTOS is a folder of sets of photographs, with the images in SET/PLACE/. Half of the places are the
+tuning half, on which the threshold of the test was chosen. The others are the test half. Images of
+two halves are not paired. Every image is a query. Each query is paired with a right image and with
+two wrong images. Similarities are computed using the capsule network.
 
 - The right image is the most similar image of the same place. The viewpoint of a webcam never
   changes. Therefore, for a webcam, the right image is one that was taken at a different hour, and
   the query is warped.
-- The wrong images are the two most similar images of other places.
+- The wrong images are the two most similar images of other places. Places whose names agree up to
+  ``__`` may overlap, so they are not paired.
 
-The script prints the share of right pairs and the share of wrong pairs that pass each test. Both
-tests match the cells of a coarse grid and use the matches that fit one homography. The test by
-share requires that these matches cover 18 % of the image. The test by number requires 90 matches.
+For each half of a set, the script prints how many right and how many wrong pairs pass each test:
+
+- ORB: 20 matches fit one epipolar geometry.
+- cells: 90 matches of the cells of a coarse grid of learned descriptors fit one homography.
+- confirmed: the number of these cells, multiplied by the share of the fine matches that fit one
+  homography, is at least 28 (``confirmed_cells``).
 """
 
 from __future__ import annotations
@@ -25,14 +30,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import LearnedMatchingConfig
-from vslam.lab.loopbench.detectors import NetworkScorer
-from vslam.lab.loopbench.measure import LEAST_COSINE, MIN_CELLS
-from vslam.loopclosure.local_matching import homography_inliers, homography_share, match_coarse
-from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
+from vslam.lab.loopbench.detectors import LocalDescriptorCache, NetworkScorer, describe
+from vslam.lab.loopbench.measure import (
+    LEAST_COSINE,
+    MIN_CONFIRMED,
+    MIN_MATCHES,
+    confirmed_cells,
+    epipolar_inliers,
+)
+from vslam.loopclosure.local_matching import homography_inliers, match_coarse
+from vslam.loopclosure.vocabulary import load
 
-MIN_SHARE = 0.18
+MIN_CELLS = 90
 WEBCAMS = "webcams"
+HALVES = "tuning", "test"
 
 
 def main() -> None:
@@ -41,51 +52,60 @@ def main() -> None:
     parser.add_argument("sets", nargs="+")
     parser.add_argument("--of-place", type=int, default=10, help="images of a place, at most")
     options = parser.parse_args()
-    print("| set | right pairs | by share, by number | wrong pairs | by share, by number |")
-    print("|---|---|---|---|---|")
+    print("| set | half | right pairs | ORB, cells, confirmed | wrong pairs | "
+          "ORB, cells, confirmed |")  # fmt: skip
+    print("|---|---|---|---|---|---|")
     for name in options.sets:
-        right, wrong = measure(options.photos / name, options.of_place)
-        cells = [
-            f"{len(passed)} | {' %, '.join(f'{100 * x:.1f}' for x in passed.mean(axis=0))} %"
-            for passed in (right, wrong)
-        ]
-        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+        for half, title in enumerate(HALVES):
+            cells = [
+                f"{len(passed)} | {', '.join(str(n) for n in passed.sum(axis=0))}"
+                for passed in measure(options.photos / name, options.of_place, half)
+            ]
+            print(f"| {name} | {title} | {' | '.join(cells)} |", flush=True)
 
 
-def measure(folder: Path, of_place: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Apply both tests to all pairs of a set of photographs.
+def measure(folder: Path, of_place: int, half: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Apply the tests to all pairs of one half of a set of photographs.
 
     Returns:
-        Two ``(N, 2)`` bool arrays, for the right and for the wrong pairs: whether a pair passes the
-        test by share, and whether it passes the test by number.
+        Two ``(N, 3)`` bool arrays, for the right and for the wrong pairs: whether a pair passes
+        each test.
     """
+    names = sorted({path.name.split("__")[0] for path in folder.iterdir() if path.is_dir()})
+    drawn = np.random.default_rng(7).permutation(len(names)) % 2
+    chosen = {name for name, of in zip(names, drawn, strict=True) if of == half}
     gallery, places = [], []
     for place in sorted(path for path in folder.iterdir() if path.is_dir()):
+        if place.name.split("__")[0] not in chosen:
+            continue
         files = sorted(place.iterdir())
         for file in files[:: -(-len(files) // of_place)]:
             gallery.append(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
             places.append(place.name)
     rng, place = np.random.default_rng(0), np.array(places)
+    group = np.array([name.split("__")[0] for name in places])
     queries = [warped(image, rng) for image in gallery] if folder.name == WEBCAMS else gallery
-    scorer, network = NetworkScorer("capsule"), LocalDescriptors()
-    of_gallery = [network.describe(image).coarse_alone() for image in gallery]
-    of_queries = of_gallery
-    if queries is not gallery:
-        of_queries = [network.describe(image).coarse_alone() for image in queries]
+    scorer, local, vocabulary = NetworkScorer("capsule"), LocalDescriptorCache(), load()
+    of_queries, of_gallery = (describe(images, vocabulary, 1) for images in (queries, gallery))
     stored = scorer.embed(gallery)
-    pairs: tuple[list[tuple[bool, bool]], ...] = ([], [])
+    pairs: tuple[list[tuple[bool, bool, bool]], ...] = ([], [])
     for q, embedded in enumerate(scorer.embed(queries)):
         order = np.argsort(-scorer.compare(embedded, stored))
-        same, other = order[place[order] == place[q]], order[place[order] != place[q]]
+        same, other = order[place[order] == place[q]], order[group[order] != group[q]]
         same = same[same != q]
         same = rng.permutation(same) if folder.name == WEBCAMS else same
         for found, images in zip(pairs, (same[:1], other[:2]), strict=True):
             for g in images:
-                a, b = of_queries[q], of_gallery[g]
-                loose = match_coarse(a, b, LearnedMatchingConfig().min_coarse_similarity)
+                one, two = of_queries[q], of_gallery[g]
+                a, b = local.of(one), local.of(two)
                 cells = homography_inliers(match_coarse(a, b, LEAST_COSINE), a, b)
-                found.append((homography_share(loose, a, b) >= MIN_SHARE, cells >= MIN_CELLS))
-    return np.array(pairs[0]), np.array(pairs[1])
+                found.append((
+                    epipolar_inliers(one, two) >= MIN_MATCHES,
+                    cells >= MIN_CELLS,
+                    confirmed_cells(one, two, local) >= MIN_CONFIRMED,
+                ))  # fmt: skip
+    shape = -1, 3
+    return np.array(pairs[0], np.bool_).reshape(shape), np.array(pairs[1], np.bool_).reshape(shape)
 
 
 def warped(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:

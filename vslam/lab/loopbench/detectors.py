@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 
 _MATCHING_LEVEL = 2  # vocabulary level with about 100 nodes; features are matched within a node
+_KEPT_FINE = 8  # images whose fine local descriptors are cached
 _KEPT_GALLERIES = 3  # galleries that are cached: the unchanged town, and those of two strengths
 
 
@@ -167,14 +168,16 @@ class NetworkScorer:
 
 
 class LocalDescriptorCache:
-    """The coarse local descriptors of images, computed once per image.
+    """The local descriptors of images.
 
-    They are kept as long as the image is used.
+    Coarse descriptors are computed once per image, and are kept as long as the image is used. Fine
+    descriptors take eight times as much memory, so only those of the last few images are kept.
     """
 
     def __init__(self) -> None:
         self._network: LocalDescriptors | None = None
         self._kept: WeakKeyDictionary[DescribedImage, DescriptorMaps] = WeakKeyDictionary()
+        self._fine: OrderedDict[DescribedImage, DescriptorMaps] = OrderedDict()
 
     def of(self, described: DescribedImage) -> DescriptorMaps:
         """Return the coarse local descriptors of an image.
@@ -183,12 +186,28 @@ class LocalDescriptorCache:
             InputError: the local-descriptor network cannot be read.
         """
         if described not in self._kept:
-            if self._network is None:
-                from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
-
-                self._network = LocalDescriptors()
-            self._kept[described] = self._network.describe(described.image).coarse_alone()
+            self._kept[described] = self._describe(described).coarse_alone()
         return self._kept[described]
+
+    def with_fine(self, described: DescribedImage) -> DescriptorMaps:
+        """Return the coarse and the fine local descriptors of an image.
+
+        Raises:
+            InputError: the local-descriptor network cannot be read.
+        """
+        if described not in self._fine:
+            self._fine[described] = self._describe(described)
+            while len(self._fine) > _KEPT_FINE:
+                self._fine.popitem(last=False)
+        self._fine.move_to_end(described)
+        return self._fine[described]
+
+    def _describe(self, described: DescribedImage) -> DescriptorMaps:
+        if self._network is None:
+            from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors
+
+            self._network = LocalDescriptors()
+        return self._network.describe(described.image)
 
 
 class DetectorSet:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import VerificationConfig
+from vslam.config import LearnedMatchingConfig, VerificationConfig
 from vslam.geometry import Matrix
 from vslam.lab.loopbench.conditions import Condition
 from vslam.lab.loopbench.detectors import (
@@ -17,7 +17,7 @@ from vslam.lab.loopbench.detectors import (
 from vslam.lab.loopbench.node_matching import match_by_node
 from vslam.lab.loopbench.schema import Curve, Gain, Score, Verified
 from vslam.lab.loopbench.sets import QuerySet, TestSet
-from vslam.loopclosure.local_matching import homography_inliers, match_coarse
+from vslam.loopclosure.local_matching import fine_agreement, homography_inliers, match_coarse
 from vslam.loopclosure.precision_recall import (
     PrecisionRecall,
     accepted_at,
@@ -29,9 +29,10 @@ from vslam.loopclosure.precision_recall import (
 )
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 
-# Verification by learned descriptors: the least number of coarse matches that fit one homography,
-# and the least cosine similarity of a match.
-MIN_CELLS, LEAST_COSINE = 90, 0.5
+# Verification by learned descriptors: the least number of confirmed cells (`confirmed_cells`), and
+# the least cosine similarity of a coarse match that is counted.
+MIN_CONFIRMED, LEAST_COSINE = 28, 0.5
+_KEYPOINTS = 600  # ORB features of the first image that are located in the second image, at most
 # Verification by ORB: the least number of matches that fit one epipolar geometry. ORB-SLAM (VII-B)
 # requires 20 matches that fit a motion in 3D.
 MIN_MATCHES = 20
@@ -221,18 +222,35 @@ class Verification:
         return self._by_orb[key]
 
     def by_learned(self, query: int, image: int) -> bool:
-        """Return whether enough learned local descriptors of two images fit one homography.
-
-        There is one descriptor for each cell of a coarse grid of the image. The limit is on the
-        number of matching cells. The share of matching cells would depend on how much of the images
-        is sky or road.
-        """
+        """Return whether learned local descriptors of two images confirm enough cells."""
         key = query, image
         if key not in self._by_learned:
-            a, b = self._local.of(self._queries[query]), self._local.of(self._gallery[image])
-            matches = match_coarse(a, b, LEAST_COSINE)
-            self._by_learned[key] = homography_inliers(matches, a, b) >= MIN_CELLS
+            confirmed = confirmed_cells(self._queries[query], self._gallery[image], self._local)
+            self._by_learned[key] = confirmed >= MIN_CONFIRMED
         return self._by_learned[key]
+
+
+def confirmed_cells(a: DescribedImage, b: DescribedImage, local: LocalDescriptorCache) -> float:
+    """Count the cells of two images that match, weighted by how well their keypoints agree.
+
+    There is one coarse descriptor for each cell of a grid of the image. The number of coarse
+    matches that fit one homography is multiplied by the share of fine matches that fit another one
+    (``fine_agreement``). Coarse matches in the sky and on repeated facades then count little.
+
+    Fewer than ``MIN_CONFIRMED`` coarse matches are returned without a search for fine matches.
+    """
+    config = LearnedMatchingConfig()
+    coarse_a, coarse_b = local.of(a), local.of(b)
+    counted = match_coarse(coarse_a, coarse_b, LEAST_COSINE)
+    cells = homography_inliers(counted, coarse_a, coarse_b)
+    if cells < MIN_CONFIRMED:
+        return float(cells)
+    guides = match_coarse(coarse_a, coarse_b, config.min_coarse_similarity)
+    chosen = np.linspace(0, len(a.xy) - 1, min(_KEYPOINTS, len(a.xy))).astype(np.int64)
+    return cells * fine_agreement(
+        a.xy[chosen], local.with_fine(a), local.with_fine(b), guides,
+        config.reach, config.min_fine_similarity,
+    )  # fmt: skip
 
 
 def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 
 from vslam.errors import counted
 from vslam.lab.loopbench.curves import draw_curves
-from vslam.lab.loopbench.measure import LENGTH, MIN_CELLS, MIN_MATCHES, TOP
+from vslam.lab.loopbench.measure import LENGTH, MIN_CONFIRMED, MIN_MATCHES, TOP
 from vslam.lab.loopbench.schema import LoopsJson, OnlineScore, Score
 from vslam.report.page import Bullets, Page, Pairs, Section, Table
 from vslam.report.render import html, markdown, write_files
@@ -34,7 +34,9 @@ _ABOUT_VERIFIED = (
     "place. Only queries whose place is in the gallery count. The next numbers are the shares for "
     "which this image is also verified by ORB, by learned descriptors, or by at least one of them. "
     f"ORB verifies a pair of images if at least {MIN_MATCHES} matches fit one epipolar geometry. "
-    f"Learned descriptors verify it if at least {MIN_CELLS} coarse matches fit one homography."
+    "The learned test counts the coarse matches that fit one homography, and multiplies their "
+    "number by the share of the fine matches that fit one homography. It verifies a pair if the "
+    f"product is at least {MIN_CONFIRMED}."
 )
 _ABOUT_SEQUENCES = (
     "The share of queries whose most similar gallery image shows the same place. The first number "

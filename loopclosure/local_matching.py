@@ -165,12 +165,7 @@ def homography_inliers(coarse: CoarseMatches, a: DescriptorMaps, b: DescriptorMa
 
 
 def fine_agreement(
-    xy: NDArray[np.float32],
-    a: DescriptorMaps,
-    b: DescriptorMaps,
-    coarse: CoarseMatches,
-    reach: int,
-    least: float,
+    xy: NDArray[np.float32], located: Located, a: DescriptorMaps, b: DescriptorMaps
 ) -> float:
     """Compute the share of the fine matches in the overlap of two images that fit a homography.
 
@@ -179,13 +174,12 @@ def fine_agreement(
     coarsely in images of different places, but their keypoints then disagree.
 
     Args:
-        xy, reach, least: as for ``locate``.
-        coarse: coarse matches from a to b.
+        xy: ``(N, 2)`` keypoints, in pixels of camera image a.
+        located: where ``locate`` found them in image b.
 
     Returns:
         The share, from 0 to 1. It is 0 if no homography is found.
     """
-    located = locate(xy, a, b, coarse, reach, least)
     seen_a, seen_b = a.scale * xy[located.found], b.scale * located.xy[located.found]
     H, inlier = _fit_homography(seen_a, seen_b, _FINE_HOMOGRAPHY_PIXELS, _FINE_HOMOGRAPHY_DRAWS)
     if H is None:

@@ -113,8 +113,9 @@ def test_fine_matches_confirm_a_scene_seen_again_and_not_one_that_is_alike_in_pa
     part = pixels.copy()
     part[:, 120:] = other[:, 120:]
 
-    def agreement(b: DescriptorMaps, guides: DescriptorMaps) -> float:
-        return fine_agreement(keypoints, a, b, match_coarse(a, guides, 0.3), 5, 0.5)
+    def agreement(b: DescriptorMaps, guides: DescriptorMaps, xy: np.ndarray = keypoints) -> float:
+        located = locate(xy, a, b, match_coarse(a, guides, 0.3), 5, 0.5)
+        return fine_agreement(xy, located, a, b)
 
     assert agreement(again, again) > 0.9
     assert 0.1 < agreement(maps(part), maps(part)) < 0.6
@@ -122,4 +123,4 @@ def test_fine_matches_confirm_a_scene_seen_again_and_not_one_that_is_alike_in_pa
     alike = another._replace(coarse=again.coarse)
     assert homography_inliers(match_coarse(a, alike, 0.5), a, alike) > 300
     assert agreement(alike, alike) < 0.3
-    assert fine_agreement(keypoints[:2], a, again, match_coarse(a, again, 0.3), 5, 0.5) == 0.0
+    assert agreement(again, again, keypoints[:2]) == 0.0

@@ -17,7 +17,12 @@ from vslam.lab.loopbench.detectors import (
 from vslam.lab.loopbench.node_matching import match_by_node
 from vslam.lab.loopbench.schema import Curve, Gain, Score, Verified
 from vslam.lab.loopbench.sets import QuerySet, TestSet
-from vslam.loopclosure.local_matching import fine_agreement, homography_inliers, match_coarse
+from vslam.loopclosure.local_matching import (
+    fine_agreement,
+    homography_inliers,
+    locate,
+    match_coarse,
+)
 from vslam.loopclosure.precision_recall import (
     PrecisionRecall,
     accepted_at,
@@ -247,10 +252,9 @@ def confirmed_cells(a: DescribedImage, b: DescribedImage, local: LocalDescriptor
         return float(cells)
     guides = match_coarse(coarse_a, coarse_b, config.min_coarse_similarity)
     chosen = np.linspace(0, len(a.xy) - 1, min(_KEYPOINTS, len(a.xy))).astype(np.int64)
-    return cells * fine_agreement(
-        a.xy[chosen], local.with_fine(a), local.with_fine(b), guides,
-        config.reach, config.min_fine_similarity,
-    )  # fmt: skip
+    xy, fine_a, fine_b = a.xy[chosen], local.with_fine(a), local.with_fine(b)
+    located = locate(xy, fine_a, fine_b, guides, config.reach, config.min_fine_similarity)
+    return cells * fine_agreement(xy, located, fine_a, fine_b)
 
 
 def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:

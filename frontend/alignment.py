@@ -63,7 +63,7 @@ def align_frame(
         frame.pyramid,
         features.xy[matched],
         octave,
-        frame.T_camera_w,
+        frame.T_cw,
         frame.xyz[matched],
         known,
         at,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import DepthImage, Image, ImageMap
 from vslam.errors import UnreadableImageError
-from vslam.features import Extracted, Features, Keypoints, Pyramid, Side
+from vslam.features import Extracted, Features, Keypoints, Pyramid
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.masks import Mask
 from vslam.frontend.orb import Extraction, build_pyramid, extract_at
@@ -28,11 +28,9 @@ class Corners(NamedTuple):
     """The features that a corner detector found in the images of a frame, and their stereo matches.
 
     Attributes:
-        found: the features of the left image, or of the right image if the left one is black.
-        matches: the stereo matches of ``found``; None if there is no right image, or if the left
-            one is black.
+        found: the features of the left image.
+        matches: the stereo matches of ``found``; None if there is no right image.
         depth: ``(H, W)`` float32 depth image of an RGB-D camera, metres; None for other cameras.
-        side: the image that ``found`` comes from.
         sides: result of comparing the exposure of the left and the right image; None without a
             right image.
     """
@@ -40,7 +38,6 @@ class Corners(NamedTuple):
     found: Extraction
     matches: StereoMatches | None = None
     depth: DepthImage | None = None
-    side: Side = Side.LEFT
     sides: Sides | None = None
 
 
@@ -81,7 +78,6 @@ class FrameImages:
         self._read_second = read_second
         self._context = context
         self._image_map = image_map
-        self._second: Image | DepthImage | None = None
         self._started: Job[Corners] | None = None
         if context.tracks_patches:
             self.pyramid = build_pyramid(left, context.config.orb)
@@ -116,19 +112,15 @@ class FrameImages:
     def image(self) -> Image:
         """The ``(H, W)`` uint8 image that the features are extracted from, for place recognition.
         Masked pixels are filled (``Mask.filled``)."""
-        image = self.left
-        if self.corners.side == Side.RIGHT:
-            image = np.array(self._second, np.uint8)  # a copy, because the caller owns the image
-        return image if self.mask is None else self.mask.filled(image)
+        return self.left if self.mask is None else self.mask.filled(self.left)
 
     def _find_corners(self, image_map: ImageMap) -> Corners:
+        second = None
         try:
-            self._second = self._read_second()
+            second = self._read_second()
         except UnreadableImageError as error:
             self.problem = str(error)
-        found = find_corners(
-            self.left, self._second, self._context, image_map, self.mask, self.pyramid
-        )
+        found = find_corners(self.left, second, self._context, image_map, self.mask, self.pyramid)
         self.sides = found.sides
         return found
 
@@ -141,8 +133,7 @@ def find_corners(
     mask: Mask | None = None,
     pyramid: Pyramid | None = None,
 ) -> Corners:
-    """Extract the features of each image and match them (the first step of extraction). If the left
-    image is black, only the right image is used, and its features have no stereo match.
+    """Extract the features of each image and match them (the first step of extraction).
 
     Args:
         left: ``(H, W)`` uint8.
@@ -155,15 +146,13 @@ def find_corners(
     camera, config = context.camera, context.config
     allowed = None if mask is None else mask.levels
     if second is None:
-        return _corners_alone(left, context, Side.LEFT, allowed, pyramid)
+        (found,) = extract_in_any_light([left], config, allowed=allowed, pyramid=pyramid)
+        return Corners(found)
     if camera.depth:
         (found,) = extract_in_any_light([left], config, allowed=allowed, pyramid=pyramid)
         return Corners(found, depth=np.asarray(second, np.float32))
     right_image = np.asarray(second, np.uint8)
     sides = compare_sides(left, right_image, config.stereo)
-    if sides.black == "left":
-        alone = _corners_alone(right_image, context, Side.RIGHT, allowed)
-        return alone._replace(sides=sides)
     pair = balanced(left, right_image, sides)
     built = pyramid if pair[0] is left else None  # it may have been brightened
     found, right = extract_in_any_light(pair, config, image_map, allowed, built)
@@ -174,14 +163,17 @@ def matched(
     corners: Corners, context: TrackingContext, keypoints: Keypoints | None = None
 ) -> Extracted:
     """Add features at given positions, and compute the columns of all features in the right image
-    (the second step of extraction).
+    (the second step of extraction). There are no features if only the left image is black, because
+    what seems to be a corner of a black image is noise.
 
     Args:
         keypoints: positions in the left image at which features are added (``extract_at``); None
             adds no features.
     """
     camera, config = context.camera, context.config
-    found, matches, depth, side, _ = corners
+    found, matches, depth, sides = corners
+    if sides is not None and sides.black == "left":
+        return Extracted.nothing()
     # Without a pyramid, matches are not aligned. Depth cameras have a rolling shutter, which moves
     # points by more than alignment corrects.
     pyramid = None if camera.depth else found.pyramid
@@ -189,7 +181,7 @@ def matched(
         scale = context.scales[found.octave]
         u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
         return Extracted(_features(found, u_right), pyramid)
-    if keypoints is not None and side == Side.LEFT:
+    if keypoints is not None:
         more = extract_at(found, *keypoints)
         found, order = found.joined(more)
         if matches is not None:
@@ -197,21 +189,10 @@ def matched(
             matches = matches.joined(added, order)
     if matches is None:
         u_right = np.full(len(found.xy), np.nan, np.float32)
-        return Extracted(_features(found, u_right), pyramid, side=side)
+        return Extracted(_features(found, u_right), pyramid)
     u_right = inliers_only(matches, found.octave)
     rows = row_offsets(found, matches.right, u_right, config.stereo)
     return Extracted(_features(found, u_right), pyramid, rows)
-
-
-def _corners_alone(
-    image: Image,
-    context: TrackingContext,
-    side: Side,
-    allowed: Pyramid | None,
-    pyramid: Pyramid | None = None,
-) -> Corners:
-    (found,) = extract_in_any_light([image], context.config, allowed=allowed, pyramid=pyramid)
-    return Corners(found, side=side)
 
 
 def _features(found: Extraction, u_right: NDArray[np.float32]) -> Features:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, Image
-from vslam.features import Extracted, FeatureGrid, Features, Keypoints, Pyramid, Side
+from vslam.features import Extracted, FeatureGrid, Features, Keypoints, Pyramid
 from vslam.frontend.masks import Mask
 from vslam.frontend.sides import Sides
 from vslam.geometry import Matrix, inverse
@@ -45,20 +45,15 @@ class FeatureSource(Protocol):
 class Frame:
     """One frame of the run: its features, its pose, and the landmarks that its features track.
 
-    In this class, "the camera" is the camera whose image the features come from. It is usually the
-    left camera. It is the right camera if the left image is black. ``T_cw`` is the pose of the left
-    camera in both cases.
-
     Attributes:
         index: index of the frame in the run.
         timestamp: seconds.
-        image: ``(H, W)`` uint8 image of the camera, for loop detectors that need it. None before
+        image: ``(H, W)`` uint8 left image, for loop detectors that need it. None before
             ``extract`` is called, or if the frame has no image.
         features, grid: the N features of the image, and a grid to search them by position. Before
             features are extracted, ``features`` has one entry for each landmark whose image patch
             was found.
-        pyramid, row_offset, side: see ``Extracted``.
-        T_camera_left: ``(4, 4)`` transform from the left camera to "the camera".
+        pyramid, row_offset: see ``Extracted``.
         T_cw: ``(4, 4)`` estimated pose of the left camera (world to camera).
         landmark: ``(N,)`` int32, id of the landmark that each feature tracks, or -1.
         xyz: ``(N, 3)`` float64 position of the landmark that each feature tracks, in the world
@@ -85,8 +80,6 @@ class Frame:
     grid: FeatureGrid
     pyramid: Pyramid | None
     row_offset: NDArray[np.float32] | None
-    side: Side
-    T_camera_left: NDArray[np.float64]
     T_cw: NDArray[np.float64]
     landmark: NDArray[np.int32]
     xyz: NDArray[np.float64]
@@ -118,18 +111,10 @@ class Frame:
             grid=FeatureGrid.of_positions(features.xy, camera.width, camera.height),
             pyramid=extracted.pyramid,
             row_offset=extracted.row_offset,
-            side=extracted.side,
-            T_camera_left=camera.T_right_left if extracted.side == Side.RIGHT else np.eye(4),
             T_cw=inverse(camera.T_mounted_camera),
             landmark=np.full(n, -1, np.int32),
             xyz=np.full((n, 3), np.nan),
         )
-
-    @property
-    def T_camera_w(self) -> Matrix:
-        """``(4, 4)`` pose of the camera (world to camera), to project landmarks into its image."""
-        T: Matrix = self.T_camera_left @ self.T_cw
-        return T
 
     def extract(self, camera: Camera) -> None:
         """Extract the features of the images, unless this has already been done.
@@ -164,16 +149,6 @@ class Frame:
     def restore(self, snapshot: Frame) -> None:
         """Restore the pose and the matches of a ``snapshot``."""
         vars(self).update(vars(snapshot))
-
-    def set_camera_pose(self, T_camera_w: Matrix) -> None:
-        """Set ``T_cw`` from the ``(4, 4)`` pose of the camera (world to camera)."""
-        self.T_cw = inverse(self.T_camera_left) @ T_camera_w
-
-    @property
-    def can_become_keyframe(self) -> bool:
-        """Whether the frame can become a keyframe. It cannot if its features come from the right
-        image, because the left image is black."""
-        return self.side == Side.LEFT
 
     @property
     def aligned(self) -> NDArray[np.bool_]:

@@ -108,7 +108,7 @@ class Relocaliser:
         localised = self._recognise(map_, frame.image, frame.features, candidates, last)
         if localised is None:
             return Found(TrackingState.LOST)
-        frame.set_camera_pose(localised.T_cw)
+        frame.T_cw = localised.T_cw
         frame.shift = None
         xyz = map_.arrays.xyz[localised.landmark]
         frame.match(localised.feature, localised.landmark, xyz)
@@ -157,7 +157,7 @@ def _locate(
     feature, landmark = match_descriptors(frame, place, config.match_distance, config.match_ratio)
     if len(feature) < config.min_matches:
         return 0
-    T_camera_w, inlier = sampled_pose(
+    T_cw, inlier = sampled_pose(
         frame, feature, place.xyz[landmark], context, min_inliers=config.min_consensus, seed=seed
     )
     if np.count_nonzero(inlier) < config.min_consensus:
@@ -165,8 +165,7 @@ def _locate(
     feature, landmark = feature[inlier], landmark[inlier]
     frame.drop_matches()
     frame.match(feature, place.ids[landmark], place.xyz[landmark])
-    frame.set_camera_pose(T_camera_w)
-    inliers = refine(frame, frame.T_cw, surroundings, context)
+    inliers = refine(frame, T_cw, surroundings, context)
     for window in (config.first_window, context.config.tracking.local_window):
         if inliers < config.min_consensus:
             return 0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import DISPARITY_WEIGHT, Camera
 from vslam.config import Config
-from vslam.features import NO_PATCHES, Features, LandmarkPatches, Side
+from vslam.features import NO_PATCHES, Features, LandmarkPatches
 from vslam.frontend.alignment import align_frame
 from vslam.frontend.frame import Frame
 from vslam.frontend.masks import Mask
@@ -30,7 +30,6 @@ from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.pose import MIN_TRUSTED, offset_effect, optimise_pose, pose_covariance
 from vslam.geometry import Matrix, compose, inverse, transform
 from vslam.map_view import LocalMap
-from vslam.odometry import adjoint
 from vslam.reprojection import stack_uvr
 
 
@@ -99,7 +98,7 @@ def track_motion(
 
     Args:
         frame: receives the pose and the matches.
-        T_cw: ``(4, 4)`` predicted pose of the left camera (world to camera).
+        T_cw: ``(4, 4)`` predicted pose (world to camera).
         local: tells which landmarks are confirmed.
 
     Returns:
@@ -132,7 +131,7 @@ def track_sudden_motion(
 
     Args:
         frame: receives the pose and the matches.
-        T_cw: ``(4, 4)`` predicted pose of the left camera (world to camera).
+        T_cw: ``(4, 4)`` predicted pose (world to camera).
         local: tells which landmarks are confirmed.
 
     Returns:
@@ -146,14 +145,13 @@ def track_sudden_motion(
     if matches < least:
         return matches, 0
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
-    T_camera_w, inlier = sampled_pose(
+    T_sampled, inlier = sampled_pose(
         frame, matched, frame.xyz[matched], context, min_inliers=least, seed=frame.index
     )
     if np.count_nonzero(inlier) < least:
         return matches, 0
     frame.drop_matches(matched[~inlier])
-    frame.set_camera_pose(T_camera_w)
-    return matches, refine(frame, frame.T_cw, local, context)
+    return matches, refine(frame, T_sampled, local, context)
 
 
 def sampled_pose(
@@ -175,8 +173,8 @@ def sampled_pose(
         seed: seed of the random samples.
 
     Returns:
-        The ``(4, 4)`` pose ``T_camera_w`` of the camera that took the image of the features, and an
-        ``(N,)`` bool mask of the inliers. There may be fewer inliers than ``min_inliers``.
+        The ``(4, 4)`` pose (world to camera), and an ``(N,)`` bool mask of the inliers. There may
+        be fewer inliers than ``min_inliers``.
     """
     config = context.config.relocalization
     return ransac_pose(
@@ -211,7 +209,7 @@ def _match_previous(
     points, source = trackable_points(previous, context)
     before = previous.features
     octave = before.octave[source].astype(np.int64)
-    in_camera = transform(frame.T_camera_left @ T_cw, points)
+    in_camera = transform(T_cw, points)
     ahead = in_camera[:, 2] > 0.1
     uvr = camera.project(np.where(ahead[:, None], in_camera, 1.0))
     advance = compose(previous.T_cw, inverse(T_cw))[2, 3]
@@ -299,7 +297,7 @@ def track_descriptors(
     frame.match(feature, reference.ids[landmark], reference.xyz[landmark])
     before = frame.snapshot()
     inliers = refine(frame, T_cw, reference, context)
-    T_camera_w, sampled = sampled_pose(
+    T_sampled, sampled = sampled_pose(
         before,
         feature,
         reference.xyz[landmark],
@@ -312,8 +310,7 @@ def track_descriptors(
     # The initial pose was so wrong that the pose of a moving object was nearer.
     frame.restore(before)
     frame.drop_matches(feature[~sampled])
-    frame.set_camera_pose(T_camera_w)
-    return refine(frame, frame.T_cw, reference, context)
+    return refine(frame, T_sampled, reference, context)
 
 
 def track_local_map(
@@ -340,7 +337,7 @@ def track_local_map(
     tracked = np.isin(local.ids, frame.landmark[frame.landmark >= 0])
     if window is None:
         window = context.local_window
-    uvr, radius, octave = predict_landmarks(frame.T_camera_w, local, window, frame.mask, context)
+    uvr, radius, octave = predict_landmarks(frame.T_cw, local, window, frame.mask, context)
     visible = radius > 0
     radius[tracked] = 0.0
     feature, landmark = _search(
@@ -358,7 +355,7 @@ def track_local_map(
 
 
 def predict_landmarks(
-    T_camera_w: Matrix,
+    T_cw: Matrix,
     local: LocalMap,
     window: float,
     mask: Mask | None,
@@ -368,7 +365,7 @@ def predict_landmarks(
     on masked pixels are marked as not visible."""
     camera = context.camera
     uvr, radius, octave = predict_view(
-        T_camera_w,
+        T_cw,
         local.xyz,
         local.normal,
         local.distance_range,
@@ -410,20 +407,19 @@ def refine(
     of inliers.
 
     Args:
-        T_cw: ``(4, 4)`` initial pose of the left camera (world to camera).
+        T_cw: ``(4, 4)`` initial pose (world to camera).
         local: tells which landmarks are confirmed.
         shift: the new ``Frame.shift``; None if no match is aligned.
     """
     frame.shift = shift
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
-    T_camera_w, inlier = optimise_pose(
-        frame.T_camera_left @ T_cw,
+    frame.T_cw, inlier = optimise_pose(
+        T_cw,
         *_observed_points(frame, matched, context),
         trusted=trusted_landmarks(
             local.confirms(frame.landmark[matched]), frame.xyz[matched], T_cw, context
         ),
     )
-    frame.set_camera_pose(T_camera_w)
     frame.drop_matches(matched[~inlier])
     return int(np.count_nonzero(inlier))
 
@@ -460,14 +456,10 @@ def uncertainty_of(
     """
     matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
     observed = _observed_points(frame, matched, context)
-    covariance, effect = pose_covariance(frame.T_camera_w, *observed), None
+    covariance, effect = pose_covariance(frame.T_cw, *observed), None
     if offset_sigma > 0.0:
-        effect = offset_sigma * offset_effect(frame.T_camera_w, *observed[:4])
-    if frame.side == Side.LEFT:
-        return covariance, effect
-    A = adjoint(inverse(frame.T_camera_left))
-    # The cameras are parallel and rigidly connected, so their translations are nearly the same.
-    return A @ covariance @ A.T, None if effect is None else A @ effect
+        effect = offset_sigma * offset_effect(frame.T_cw, *observed[:4])
+    return covariance, effect
 
 
 def _observed_points(

@@ -1,19 +1,18 @@
-"""A frame: the data from its images, and its pose, seen from either camera of the pair."""
+"""A frame: the data from its images, and its pose."""
 
 from __future__ import annotations
 
 from dataclasses import fields
 
 import numpy as np
-import pytest
 
 from vslam.camera import Camera
 from vslam.config import Config
-from vslam.features import Extracted, Features, Side
+from vslam.features import Extracted, Features
 from vslam.frontend.frame import Frame
 from vslam.frontend.relocaliser import relocalise
 from vslam.frontend.tracking import TrackingContext, refine
-from vslam.geometry import compose, se3_exp, transform
+from vslam.geometry import se3_exp, transform
 from vslam.map import Map
 from vslam.map_kernels import link_many
 from vslam.map_view import NO_LANDMARKS, LocalMap, local_map
@@ -34,9 +33,9 @@ def descriptors() -> np.ndarray:
     return np.random.default_rng(1).integers(0, 256, (N, 32), dtype=np.uint8)
 
 
-def seen_from(T_camera_w: np.ndarray) -> Features:
+def seen_from(T_cw: np.ndarray) -> Features:
     """Return the features of the points in the image of a camera, without stereo matches."""
-    xy = CAMERA.project(transform(T_camera_w, points()))[:, :2]
+    xy = CAMERA.project(transform(T_cw, points()))[:, :2]
     nothing = np.full(N, np.nan, np.float32)
     octave, angle = np.zeros(N, np.uint8), np.zeros(N, np.float32)
     return Features(xy.astype(np.float32), octave, angle, descriptors(), nothing)
@@ -57,25 +56,11 @@ def test_features_are_a_table_and_a_checkpoint_keeps_all_of_it():
     assert all(len(getattr(seen_from(T_CW), name)) == N for name in names)
 
 
-@pytest.mark.parametrize("side", Side)
-def test_the_pose_of_a_frame_is_that_of_the_left_camera(side):
-    T_camera_w = T_CW if side == Side.LEFT else compose(CAMERA.T_right_left, T_CW)
-    frame = Frame.of(Extracted(seen_from(T_camera_w), side=side), CAMERA)
-    assert frame.can_become_keyframe == (side == Side.LEFT)
-    frame.set_camera_pose(T_camera_w)
-    np.testing.assert_allclose(frame.T_cw, T_CW, atol=1e-12)
-    np.testing.assert_allclose(frame.T_camera_w, T_camera_w, atol=1e-12)
-
-
-@pytest.mark.parametrize("side", Side)
-def test_whichever_camera_saw_a_frame_the_left_one_is_found(side):
-    """The pose is refined from a nearby pose, and found by relocalisation in a map."""
-    T_camera_w = T_CW if side == Side.LEFT else compose(CAMERA.T_right_left, T_CW)
-    extracted = Extracted(seen_from(T_camera_w), side=side)
-    refined = Frame.of(extracted, CAMERA)
+def test_the_pose_of_a_frame_is_refined_from_a_nearby_one_and_found_by_relocalisation():
+    refined = Frame.of(Extracted(seen_from(T_CW)), CAMERA)
     refined.landmark, refined.xyz = np.arange(N, dtype=np.int32), points()
     assert refine(refined, se3_exp(np.full(6, 0.02)) @ T_CW, NO_LANDMARKS, CONTEXT) == N
-    found = Frame.of(extracted, CAMERA)
+    found = Frame.of(Extracted(seen_from(T_CW)), CAMERA)
     assert relocalise(found, place(), place(), CONTEXT, seed=0) > 0.8 * N
     for frame in (refined, found):
         np.testing.assert_allclose(frame.T_cw, T_CW, atol=1e-4)

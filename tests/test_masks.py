@@ -14,7 +14,7 @@ from source_files import open_from, write_calibration, write_images, write_video
 from vslam.config import Config
 from vslam.errors import InputError, UnreadableImageError
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.features import Side, TrackingState
+from vslam.features import TrackingState
 from vslam.frontend import tracker
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.masks import REACH, Mask
@@ -150,15 +150,6 @@ def test_places_are_recognised_by_what_is_not_masked(corridor, hooded, mask):
         assert (shown[:HOOD] == corridor.left[0][:HOOD]).all()
         assert (shown[HOOD:] == int(corridor.left[0][:HOOD].mean())).all()
         assert images.left is left
-
-
-def test_the_right_image_is_masked_where_it_replaces_a_black_left_one(corridor, hooded, mask):
-    context = TrackingContext.create(corridor.camera, Config())
-    black = np.zeros_like(corridor.left[0])
-    images = FrameImages(black, lambda: hooded[1][0], context, mask=Mask.of(mask, ORB))
-    assert images.extracted.side == Side.RIGHT
-    assert images.extracted.features.xy[:, 1].max() < HOOD - REACH
-    assert (images.image[HOOD:] == images.image[-1, 0]).all()
 
 
 def test_step_refuses_a_mask_that_does_not_fit(corridor):

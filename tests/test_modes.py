@@ -10,7 +10,7 @@ from parts import CAMERA, Points, ahead
 from test_mapper import Drive, at, begin_with_two_views, bytes_of_map, see_points, see_without_depth
 
 from vslam.camera import Camera
-from vslam.features import Side, TrackingState
+from vslam.features import TrackingState
 from vslam.frontend.frame import Frame
 from vslam.frontend.standstill import Standstill
 from vslam.frontend.tracker import Found, Tracker
@@ -264,15 +264,6 @@ def test_a_camera_that_comes_to_rest_at_its_reference_keyframe_makes_no_other(
     frame.T_cw = ahead(metres, pixels / CAMERA.fx) @ drive.mapper.view.T_reference
     drive.stand_still()
     assert drive.mode.update_map(frame, found(frame)) != stays
-
-
-def test_a_frame_of_the_right_camera_becomes_no_keyframe():
-    drive = Building.with_a_map(max_interval_s=0.05)
-    frame = drive.placed_frame()
-    frame.side = Side.RIGHT
-    assert not drive.mode.update_map(frame, found(frame))
-    frame.side = Side.LEFT
-    assert drive.mode.update_map(frame, found(frame))
 
 
 @pytest.mark.parametrize(("idle", "made"), [(True, True), (False, False)])

@@ -245,15 +245,6 @@ def test_few_inliers_make_a_frame_that_is_found_weak_or_lost(n, state, keyframe)
     assert found.relocalised == (keyframe >= 0)
 
 
-def test_a_frame_of_the_right_camera_is_found_where_the_left_one_is():
-    recognise = Recognise(30)
-    place = Place.create([], recognise)
-    place.frame.T_camera_left = CAMERA.T_right_left
-    place.find()
-    expected = inverse(CAMERA.T_right_left) @ recognise.localised.T_cw
-    np.testing.assert_allclose(place.frame.T_cw, expected, atol=1e-12)
-
-
 def test_a_frame_that_is_not_doubtful_is_not_looked_for():
     place, _ = by_orb()
     track_elsewhere(place.frame)

@@ -110,13 +110,6 @@ class Camera:
         return replace(self, baseline=0.0, depth=False, right_delay=0.0)
 
     @property
-    def T_right_left(self) -> NDArray[np.float64]:
-        """``(4, 4)`` pose of the left camera in the frame of the right camera."""
-        T = np.eye(4)
-        T[0, 3] = -self.baseline
-        return T
-
-    @property
     def T_mounted_camera(self) -> NDArray[np.float64]:
         """``(4, 4)`` rotation from the frame of the left camera to that of the camera as
         mounted."""

@@ -101,36 +101,26 @@ Keypoints = tuple[NDArray[np.float32], NDArray[np.uint8]]
 """``(N, 2)`` positions in pixels at full resolution, and ``(N,)`` pyramid levels."""
 
 
-class Side(StrEnum):
-    """One camera of a stereo pair. A single camera counts as the left one."""
-
-    LEFT = "left"
-    RIGHT = "right"
-
-
 @dataclass(frozen=True)
 class Extracted:
     """The result of feature extraction for one frame.
 
     Attributes:
-        features: the N features that were extracted from the image of ``side``.
+        features: the N features that were extracted from the left image.
         pyramid: the pyramid of this image. None if matches in this image are not refined to
             sub-pixel accuracy.
         row_offset: ``(N,)`` float32, row of the stereo match in the right image minus row of the
             feature in the left image, in pixels. NaN where it was not measured, or None if it was
             not measured for any feature.
-        side: the camera whose image was used. Features are extracted from the right image only if
-            the left image is black. In this case, no feature has a stereo match.
     """
 
     features: Features
     pyramid: Pyramid | None = None
     row_offset: NDArray[np.float32] | None = None
-    side: Side = Side.LEFT
 
     @classmethod
     def nothing(cls) -> Extracted:
-        """Return a result without features, for a frame without images."""
+        """Return a result without features, for a frame whose left image is missing or black."""
         return cls(Features.none())
 
 

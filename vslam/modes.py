@@ -129,8 +129,6 @@ class MapBuilding(Mode):
     def update_map(self, frame: PlacedFrame, found: Found) -> bool:
         self.starter.reset()
         self._mapper.count(found.visible, frame.landmark[frame.landmark >= 0])
-        if not frame.can_become_keyframe:
-            return False
         evidence = self.policy.observe(
             frame,
             self._mapper.view,
@@ -190,9 +188,7 @@ class MapBuilding(Mode):
             return True
         before = frame.snapshot()
         self._mapper.rig.extract(frame, frame.twist)
-        if frame.can_become_keyframe and self._tracker.match_features(
-            frame, before, self._mapper.view
-        ):
+        if self._tracker.match_features(frame, before, self._mapper.view):
             return True
         frame.restore(before)
         return False

@@ -171,15 +171,15 @@ def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
 def rig_warnings(sides: ComparedSides) -> list[str]:
     """Return warnings about a camera whose images are black or darker than the other camera's."""
     warnings = []
-    for side, other, black in (
-        ("left", "right", sides.n_black_left),
-        ("right", "left", sides.n_black_right),
+    for side, other, black, what in (
+        ("left", "right", sides.n_black_left, "are lost"),
+        ("right", "left", sides.n_black_right, "were tracked with the left image alone"),
     ):
         if black >= _FEWEST:
             warnings.append(
                 f"The {side} image was black in {black} of {sides.n} frames while the {other} "
-                f"image was not: these frames were tracked with the {other} image alone. Check the "
-                f"cable, shutter and lens cap of the {side} camera."
+                f"image was not: these frames {what}. Check the cable, shutter and lens cap of the "
+                f"{side} camera."
             )
     darker = sides.darker_stops
     if len(darker) >= _FEWEST:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import DepthImage, Image, ImageMap
+from vslam.context import Context
 from vslam.errors import UnreadableImageError
 from vslam.features import Extracted, Features, Keypoints, Pyramid
 from vslam.frontend.depth import columns_of_depth
@@ -19,7 +20,6 @@ from vslam.frontend.pose_alignment import coarse_levels
 from vslam.frontend.side_delay import row_offsets
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import StereoMatches, inliers_only, match_stereo
-from vslam.frontend.tracking import TrackingContext
 from vslam.frontend.weak_images import extract_in_any_light
 from vslam.workers import Job, Urgency, Workers
 
@@ -61,7 +61,7 @@ class FrameImages:
         self,
         left: Image,
         read_second: Callable[[], Image | DepthImage | None],
-        context: TrackingContext,
+        context: Context,
         image_map: ImageMap = map,
         mask: Mask | None = None,
     ) -> None:
@@ -128,7 +128,7 @@ class FrameImages:
 def find_corners(
     left: Image,
     second: Image | DepthImage | None,
-    context: TrackingContext,
+    context: Context,
     image_map: ImageMap = map,
     mask: Mask | None = None,
     pyramid: Pyramid | None = None,
@@ -159,9 +159,7 @@ def find_corners(
     return Corners(found, match_stereo(found, right, camera, config.stereo), sides=sides)
 
 
-def matched(
-    corners: Corners, context: TrackingContext, keypoints: Keypoints | None = None
-) -> Extracted:
+def matched(corners: Corners, context: Context, keypoints: Keypoints | None = None) -> Extracted:
     """Add features at given positions, and compute the columns of all features in the right image
     (the second step of extraction). There are no features if only the left image is black, because
     what seems to be a corner of a black image is noise.

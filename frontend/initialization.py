@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera
 from vslam.config import InitializationConfig
+from vslam.context import Context
 from vslam.frontend.frame import Frame
 from vslam.frontend.matching import Projections, Searchable, consistent_orientation, search_windows
-from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix
 from vslam.reprojection import CHI2_MONO, stack_uvr
 
@@ -70,7 +70,7 @@ class TwoViews:
 
 
 def match_views(
-    one: Frame, two: Frame, context: TrackingContext
+    one: Frame, two: Frame, context: Context
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Match the features of two frames by their descriptors. Each feature of frame ``one`` is
     searched for in a window around the same position in frame ``two``.

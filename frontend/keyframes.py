@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vslam.config import KeyframeConfig
+from vslam.context import Context
 from vslam.frontend.frame import Frame
-from vslam.frontend.tracking import TrackingContext, feature_depth
+from vslam.frontend.tracking import feature_depth
 from vslam.geometry import transform
 from vslam.map_view import MapView
 from vslam.states import PolicyState
@@ -151,7 +152,7 @@ def close_ratio(state: PolicyState, tracked_close: int, frame: int) -> float:
 class KeyframePolicy:
     """Decides whether a tracked frame becomes a keyframe."""
 
-    def __init__(self, context: TrackingContext) -> None:
+    def __init__(self, context: Context) -> None:
         self._context = context
         self._config = context.config.keyframes
         first = self._config.first_gain * self._config.min_tracked_close

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import OrbConfig
+from vslam.context import scale_factors
 from vslam.features import Pyramid, level_of
 from vslam.frontend.corners import fast_scores, local_maxima, spread
 from vslam.kernels import borrowed, inner_kernel, kernel
@@ -137,12 +138,6 @@ def _is_free(pixel, existing):
                 free[i] = False
                 break
     return free
-
-
-def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
-    """Return the ``(L,)`` scales of the pyramid levels: full-resolution pixels per pixel of the
-    level."""
-    return config.scale_factor ** np.arange(config.n_levels, dtype=np.float64)
 
 
 @cache

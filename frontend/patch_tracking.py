@@ -14,12 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.context import Context
 from vslam.features import PATCH_RADIUS, Features, Pyramid
 from vslam.frontend.alignment import find_patches
 from vslam.frontend.masks import Mask
 from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
 from vslam.frontend.standstill import MEASURE_SHARE, Standstill, is_small, still_stands
-from vslam.frontend.tracking import TrackingContext, predict_landmarks, trusted_landmarks
+from vslam.frontend.tracking import predict_landmarks, trusted_landmarks
 from vslam.geometry import Matrix, orthonormalised, transform
 from vslam.map_view import MapView
 
@@ -116,7 +117,7 @@ def track_patches(
     pyramid: Pyramid,
     T_cw: Matrix,
     view: MapView,
-    context: TrackingContext,
+    context: Context,
     mask: Mask | None = None,
 ) -> PatchTrack:
     """Search an image for the image patches of the landmarks in the local map, and optimise the
@@ -136,7 +137,7 @@ def track_standing(
     T_cw: Matrix,
     standstill: Standstill,
     view: MapView,
-    context: TrackingContext,
+    context: Context,
     mask: Mask | None = None,
 ) -> PatchTrack:
     """Do the same for a camera that stood still in the last frame. The result has no landmarks if
@@ -166,7 +167,7 @@ def track_standing(
 
 
 def _search(
-    pyramid: Pyramid, T_cw: Matrix, view: MapView, context: TrackingContext, mask: Mask | None
+    pyramid: Pyramid, T_cw: Matrix, view: MapView, context: Context, mask: Mask | None
 ) -> _Found:
     known, local = view.patches, view.with_patches
     camera, scales, config = context.camera, context.scales, context.config.alignment
@@ -190,7 +191,7 @@ def _optimised(
     found: _Found,
     T_cw: Matrix,
     view: MapView,
-    context: TrackingContext,
+    context: Context,
     *,
     ask_trusted: bool = True,
 ) -> PatchTrack:

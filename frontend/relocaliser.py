@@ -12,17 +12,12 @@ from typing import Protocol
 import numpy as np
 
 from vslam.camera import Image
+from vslam.context import Context
 from vslam.features import Features, TrackingState
 from vslam.frontend.frame import Frame
 from vslam.frontend.matching import count_elsewhere
 from vslam.frontend.tracker import Found, judge
-from vslam.frontend.tracking import (
-    TrackingContext,
-    match_descriptors,
-    refine,
-    sampled_pose,
-    track_local_map,
-)
+from vslam.frontend.tracking import match_descriptors, refine, sampled_pose, track_local_map
 from vslam.loops import LastSeen, Localisation, LoopCandidate
 from vslam.map import Map
 from vslam.map_view import LocalMap, local_map
@@ -55,7 +50,7 @@ class Relocaliser:
     """Relocalises lost and doubtful frames at keyframes that look similar. A frame is doubtful if
     it has so few inliers that its matches may be wrong."""
 
-    def __init__(self, context: TrackingContext, locate: Locate, recognise: Recognise) -> None:
+    def __init__(self, context: Context, locate: Locate, recognise: Recognise) -> None:
         """
         Args:
             locate: function that returns the keyframes that look similar to a frame, best first.
@@ -121,7 +116,7 @@ class Relocaliser:
 
 
 def relocalise(
-    frame: Frame, place: LocalMap, surroundings: LocalMap, context: TrackingContext, seed: int
+    frame: Frame, place: LocalMap, surroundings: LocalMap, context: Context, seed: int
 ) -> int:
     """Find the pose of a frame at a place that looks similar, without a predicted pose.
 
@@ -151,7 +146,7 @@ def relocalise(
 
 
 def _locate(
-    frame: Frame, place: LocalMap, surroundings: LocalMap, context: TrackingContext, seed: int
+    frame: Frame, place: LocalMap, surroundings: LocalMap, context: Context, seed: int
 ) -> int:
     config = context.config.relocalization
     feature, landmark = match_descriptors(frame, place, config.match_distance, config.match_ratio)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera
+from vslam.context import Context
 from vslam.features import Extracted, TrackingState, TrackResult, nearest_features
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
@@ -24,7 +25,6 @@ from vslam.frontend.pose import MIN_TRUSTED
 from vslam.frontend.pose_alignment import align_pose, coarse_pyramid, coarse_shapes
 from vslam.frontend.standstill import Standstill, has_come_to_rest, is_small
 from vslam.frontend.tracking import (
-    TrackingContext,
     track_descriptors,
     track_local_map,
     track_motion,
@@ -101,7 +101,7 @@ class Found:
         return self.keyframe >= 0
 
 
-def judge(n_matches: int, n_inliers: int, context: TrackingContext) -> TrackingState:
+def judge(n_matches: int, n_inliers: int, context: Context) -> TrackingState:
     config = context.config.tracking
     # The search windows of an RGB-D camera are wide, so that even a wrong pose has some inliers.
     share = config.depth_min_inlier_ratio if context.camera.depth else 0.0
@@ -119,7 +119,7 @@ class Tracker:
         lost_frames: number of frames that have been lost since the frame ``last``.
     """
 
-    def __init__(self, context: TrackingContext) -> None:
+    def __init__(self, context: Context) -> None:
         self.status = TrackerStatus.UNKNOWN
         self.last: Frame | None = None
         self.lost_frames = 0

@@ -6,13 +6,11 @@ never accessed, so local mapping can write to it at the same time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import DISPARITY_WEIGHT, Camera
-from vslam.config import Config
+from vslam.context import Context
 from vslam.features import NO_PATCHES, Features, LandmarkPatches
 from vslam.frontend.alignment import align_frame
 from vslam.frontend.frame import Frame
@@ -25,56 +23,11 @@ from vslam.frontend.matching import (
     search_all,
     search_windows,
 )
-from vslam.frontend.orb import scale_factors
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.pose import MIN_TRUSTED, offset_effect, optimise_pose, pose_covariance
 from vslam.geometry import Matrix, compose, inverse, transform
 from vslam.map_view import LocalMap
 from vslam.reprojection import stack_uvr
-
-
-@dataclass(frozen=True)
-class TrackingContext:
-    """The camera, the configuration, and quantities that are derived from them.
-
-    Attributes:
-        scales: ``(levels,)`` pyramid scale factors.
-    """
-
-    camera: Camera
-    config: Config
-    scales: NDArray[np.float64]
-
-    @classmethod
-    def create(cls, camera: Camera, config: Config) -> TrackingContext:
-        return cls(camera, config, scale_factors(config.orb))
-
-    @property
-    def tracks_patches(self) -> bool:
-        """Whether frames are tracked using image patches when possible. For RGB-D cameras,
-        patch-based tracking is less accurate and not faster (docs/research/performance.md)."""
-        method, camera = self.config.tracking.method, self.camera
-        if method == "auto":
-            return camera.sensor == "stereo"
-        return method == "patches" and not camera.depth
-
-    @property
-    def close_depth(self) -> float:
-        """Depth below which a stereo point is close, metres (section III-A of the ORB-SLAM2
-        paper)."""
-        return self.config.stereo.close_depth_baselines * self.camera.baseline
-
-    @property
-    def motion_window(self) -> float:
-        """Search radius at octave 0 around points that the previous frame observed, pixels."""
-        config = self.config.tracking
-        return config.depth_motion_window if self.camera.depth else config.motion_window
-
-    @property
-    def local_window(self) -> float:
-        """Search radius at octave 0 around landmarks of the local map, pixels."""
-        config = self.config.tracking
-        return config.depth_local_window if self.camera.depth else config.local_window
 
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
@@ -88,7 +41,7 @@ def track_motion(
     previous: Frame,
     T_cw: NDArray[np.float64],
     local: LocalMap,
-    context: TrackingContext,
+    context: Context,
 ) -> tuple[int, int]:
     """Track a frame against the points of the previous frame. The points are matched near their
     projections with the predicted pose, and the pose is optimised.
@@ -122,7 +75,7 @@ def track_sudden_motion(
     previous: Frame,
     T_cw: NDArray[np.float64],
     local: LocalMap,
-    context: TrackingContext,
+    context: Context,
 ) -> tuple[int, int]:
     """Track a frame against the points of the previous frame, although the predicted pose is wrong.
 
@@ -158,7 +111,7 @@ def sampled_pose(
     frame: Frame,
     feature: NDArray[np.integer],
     points: NDArray[np.float64],
-    context: TrackingContext,
+    context: Context,
     *,
     min_inliers: int,
     seed: int,
@@ -192,7 +145,7 @@ def _match_previous(
     frame: Frame,
     previous: Frame,
     T_cw: NDArray[np.float64],
-    context: TrackingContext,
+    context: Context,
     window: float,
     ratio: float,
 ) -> int:
@@ -238,7 +191,7 @@ def _match_previous(
 
 
 def trackable_points(
-    previous: Frame, context: TrackingContext
+    previous: Frame, context: Context
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the points that a frame observed: its landmarks and its other close stereo points.
 
@@ -274,7 +227,7 @@ def track_descriptors(
     frame: Frame,
     reference: LocalMap,
     T_cw: NDArray[np.float64],
-    context: TrackingContext,
+    context: Context,
 ) -> int:
     """Match landmarks using only their descriptors, without a predicted pose, and then optimise the
     pose.
@@ -316,7 +269,7 @@ def track_descriptors(
 def track_local_map(
     frame: Frame,
     local: LocalMap,
-    context: TrackingContext,
+    context: Context,
     window: float | None = None,
     patches: LandmarkPatches = NO_PATCHES,
 ) -> tuple[int, int, NDArray[np.int32]]:
@@ -359,7 +312,7 @@ def predict_landmarks(
     local: LocalMap,
     window: float,
     mask: Mask | None,
-    context: TrackingContext,
+    context: Context,
 ) -> tuple[Matrix, Matrix, NDArray[np.int64]]:
     """Predict where the landmarks of a local map appear in the image (``predict_view``). Landmarks
     on masked pixels are marked as not visible."""
@@ -384,7 +337,7 @@ def _search(
     frame: Frame,
     projections: Projections,
     free: NDArray[np.bool_],
-    context: TrackingContext,
+    context: Context,
     ratio: float,
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Return the ``(M,)`` indices of the features that ``search_windows`` matches, and the ``(M,)``
@@ -400,7 +353,7 @@ def refine(
     frame: Frame,
     T_cw: NDArray[np.float64],
     local: LocalMap,
-    context: TrackingContext,
+    context: Context,
     shift: NDArray[np.float32] | None = None,
 ) -> int:
     """Optimise the pose of a frame using all its matches, drop the outliers, and return the number
@@ -425,7 +378,7 @@ def refine(
 
 
 def trusted_landmarks(
-    confirmed: NDArray[np.bool_], xyz: Matrix, T_cw: Matrix, context: TrackingContext
+    confirmed: NDArray[np.bool_], xyz: Matrix, T_cw: Matrix, context: Context
 ) -> NDArray[np.bool_]:
     """Choose the landmarks that tell the pose of the camera from that of a moving object: confirmed
     close landmarks. Far landmarks agree with both. If there are few close ones, all confirmed
@@ -441,7 +394,7 @@ def trusted_landmarks(
 
 
 def uncertainty_of(
-    frame: Frame, offset_sigma: float, context: TrackingContext
+    frame: Frame, offset_sigma: float, context: Context
 ) -> tuple[Matrix, Matrix | None]:
     """Estimate the uncertainty of the pose and of the motion of a tracked frame.
 
@@ -463,7 +416,7 @@ def uncertainty_of(
 
 
 def _observed_points(
-    frame: Frame, matched: NDArray[np.integer], context: TrackingContext
+    frame: Frame, matched: NDArray[np.integer], context: Context
 ) -> tuple[NDArray[np.float64], ...]:
     """Return the arguments of ``optimise_pose`` that follow ``T_cw``, for the points that the
     features ``matched`` track. Aligned matches have their aligned positions."""
@@ -480,7 +433,7 @@ def _observed_points(
 
 
 def observations(
-    frame: Frame, feature: NDArray[np.integer], context: TrackingContext
+    frame: Frame, feature: NDArray[np.integer], context: Context
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the observed image positions of N features of a frame, and their weights.
 

@@ -7,6 +7,7 @@ import pytest
 
 from vslam.camera import Camera
 from vslam.config import Config
+from vslam.context import Context
 from vslam.features import (
     NO_PATCHES,
     PATCH_PIXELS,
@@ -20,7 +21,7 @@ from vslam.frontend.frame import Frame
 from vslam.frontend.orb import build_pyramid, extract
 from vslam.frontend.patches import RecentPatches, patches_around
 from vslam.frontend.rig import RigCalibration
-from vslam.frontend.tracking import TrackingContext, refine
+from vslam.frontend.tracking import refine
 from vslam.geometry import inverse, se3_exp, transform
 from vslam.map import Map
 from vslam.map_kernels import link_many, unlink
@@ -146,7 +147,7 @@ def test_patches_are_the_pixels_around_the_keypoints():
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (480, 640), dtype=np.uint8)
 CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.5, 640, 480)
-CONTEXT = TrackingContext.create(CAMERA, Config())
+CONTEXT = Context.create(CAMERA, Config())
 
 
 def features_at(u, v, octave, n):

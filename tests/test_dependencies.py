@@ -28,7 +28,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.errors", "vslam.machine", "vslam.method", "vslam.workers"),
     ("vslam.kernels", "vslam.plugins", "vslam.untrusted", "vslam.lock_file", "vslam.file_kinds"),
     ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.camera"),
-    ("vslam.odometry",),
+    ("vslam.odometry", "vslam.context"),
     ("vslam.features",),
     (
         "vslam.loops",

@@ -8,10 +8,11 @@ import numpy as np
 
 from vslam.camera import Camera
 from vslam.config import Config
+from vslam.context import Context
 from vslam.features import Extracted, Features
 from vslam.frontend.frame import Frame
 from vslam.frontend.relocaliser import relocalise
-from vslam.frontend.tracking import TrackingContext, refine
+from vslam.frontend.tracking import refine
 from vslam.geometry import se3_exp, transform
 from vslam.map import Map
 from vslam.map_kernels import link_many
@@ -19,7 +20,7 @@ from vslam.map_view import NO_LANDMARKS, LocalMap, local_map
 from vslam.maps.checkpoint import FEATURES
 
 CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.5, 640, 480)
-CONTEXT = TrackingContext.create(CAMERA, Config())
+CONTEXT = Context.create(CAMERA, Config())
 T_CW = se3_exp(np.array([0.4, -0.1, -1.0, 0.02, 0.1, -0.05]))
 N = 150
 

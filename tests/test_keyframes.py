@@ -9,6 +9,7 @@ import pytest
 from parts import CAMERA, Points
 
 from vslam.config import Config, KeyframeConfig
+from vslam.context import Context
 from vslam.frontend.frame import Frame
 from vslam.frontend.keyframes import (
     KeyframeEvidence,
@@ -17,7 +18,6 @@ from vslam.frontend.keyframes import (
     needs_keyframe,
     needs_monocular_keyframe,
 )
-from vslam.frontend.tracking import TrackingContext
 
 CONFIG = KeyframeConfig(
     max_interval_s=1.0,
@@ -152,7 +152,7 @@ KNOWN = {"n_inliers": 150, "n_shared": 100, "n_place": 200}
 ])  # fmt: skip
 def test_a_place_is_known_that_is_tracked_like_its_old_keyframe(changes, known):
     config = Config(keyframes=KeyframeConfig(max_tracked_ratio=0.75, known_ratio=0.5))
-    decides = KeyframePolicy(TrackingContext.create(CAMERA, config))
+    decides = KeyframePolicy(Context.create(CAMERA, config))
     assert decides.is_known(**KNOWN | changes) == known
 
 
@@ -163,7 +163,7 @@ CLOSE = np.count_nonzero(POINTS.xyz[:, 2] < 20.0)
 
 
 def policy(camera=CAMERA) -> KeyframePolicy:
-    return KeyframePolicy(TrackingContext.create(camera, Config(keyframes=CONFIG)))
+    return KeyframePolicy(Context.create(camera, Config(keyframes=CONFIG)))
 
 
 def frame(*, close: int, far: int = 0) -> Frame:

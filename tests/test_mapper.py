@@ -13,12 +13,13 @@ from parts import CAMERA, InstantWorkers, Points, ahead, frame_of
 from vslam.camera import Camera
 from vslam.closing import LoopSearch
 from vslam.config import Config
+from vslam.context import Context
 from vslam.features import PATCH_PIXELS, Extracted, Features, KeyframePatches
 from vslam.frontend.frame import Frame
 from vslam.frontend.orb import build_pyramid
 from vslam.frontend.patches import patches_around
 from vslam.frontend.rig import RigCalibration
-from vslam.frontend.tracking import TrackingContext, track_local_map
+from vslam.frontend.tracking import track_local_map
 from vslam.geometry import inverse, se3_exp
 from vslam.loopclosure.detector import NoDetector
 from vslam.map import Map
@@ -113,7 +114,7 @@ class Drive:
         **keyframes: float,
     ) -> None:
         config = Config.model_validate({"keyframes": keyframes, "tracking": tracking or {}})
-        self.context = TrackingContext.create(camera, config)
+        self.context = Context.create(camera, config)
         self.closing = closing or Closing()
         self.rig = RigCalibration(camera, config.stereo, self.context.scales)
         self.mapper = Mapper(self.context, self.closing, self.rig, workers or Workers(1))

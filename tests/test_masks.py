@@ -12,6 +12,7 @@ import pytest
 from source_files import open_from, write_calibration, write_images, write_video
 
 from vslam.config import Config
+from vslam.context import Context
 from vslam.errors import InputError, UnreadableImageError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import TrackingState
@@ -19,7 +20,6 @@ from vslam.frontend import tracker
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.masks import REACH, Mask
 from vslam.frontend.pose_alignment import align_pose
-from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import transform
 from vslam.report.finished_run import open_images, read_run
 from vslam.run.preparation import prepare_frame
@@ -78,7 +78,7 @@ def test_a_masked_hood_does_not_hold_the_camera_back(corridor, hooded, mask, met
 
 
 def test_features_keep_their_distance_and_others_take_their_place(corridor, mask):
-    context = TrackingContext.create(corridor.camera, Config())
+    context = Context.create(corridor.camera, Config())
     made = [
         FrameImages(corridor.left[0], lambda: corridor.right[0], context, mask=of_left)
         for of_left in (None, Mask.of(mask, ORB))
@@ -95,7 +95,7 @@ def test_cameras_without_a_right_image_are_masked(corridor, mask, sensor):
     camera, second = corridor.camera.left_camera(), None
     if sensor == "rgbd":
         camera, second = replace(corridor.camera, depth=True), np.ones(mask.shape, np.float32)
-    context = TrackingContext.create(camera, Config())
+    context = Context.create(camera, Config())
     images = FrameImages(corridor.left[0], lambda: second, context, mask=Mask.of(mask, ORB))
     assert images.extracted.features.xy[:, 1].max() < HOOD - REACH
 
@@ -142,7 +142,7 @@ def test_a_mask_that_hides_nothing_changes_nothing(corridor, mask):
 
 
 def test_places_are_recognised_by_what_is_not_masked(corridor, hooded, mask):
-    context = TrackingContext.create(corridor.camera, Config())
+    context = Context.create(corridor.camera, Config())
     of_left = Mask.of(mask, ORB)
     for left in (corridor.left[0], hooded[0][0]):
         images = FrameImages(left, lambda: corridor.right[0], context, mask=of_left)
@@ -234,7 +234,7 @@ def test_a_wrong_mask_of_one_frame_costs_this_frame(folder, mask, tmp_path):
     source = opened(folder, tmp_path)
     with pytest.raises(UnreadableImageError, match=r"2\.png: hides the whole image"):
         source.stored[2].mask()
-    context = TrackingContext.create(source.camera, Config())
+    context = Context.create(source.camera, Config())
     prepared = [prepare_frame(frame, context) for frame in source.stored]
     assert [one.problem is None for one in prepared] == [True, True, False, True]
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from vslam.config import Config
+from vslam.context import Context
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import Perturbation
 from vslam.errors import UnreadableImageError
@@ -20,7 +21,7 @@ from vslam.frontend.orb import build_pyramid, level_shapes
 from vslam.frontend.patch_tracking import track_patches
 from vslam.frontend.pose_alignment import align_pose, coarse_levels, coarse_pyramid, coarse_shapes
 from vslam.frontend.tracker import Tracker
-from vslam.frontend.tracking import TrackingContext, feature_depth
+from vslam.frontend.tracking import feature_depth
 from vslam.geometry import inverse, se3_exp, se3_log, transform
 from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
@@ -39,7 +40,7 @@ def coarse(image):
 
 @pytest.fixture(scope="module")
 def points(corridor):
-    context = TrackingContext.create(corridor.camera, CONFIG)
+    context = Context.create(corridor.camera, CONFIG)
     images = FrameImages(corridor.left[FIRST], lambda: corridor.right[FIRST], context)
     features = images.extracted.features
     depth = feature_depth(features, corridor.camera)
@@ -280,8 +281,8 @@ def test_the_same_bytes_with_two_threads_and_after_a_resume(corridor, tmp_path):
 
 def test_depth_cameras_are_tracked_by_features(corridor):
     camera = replace(corridor.camera, depth=True)
-    assert not TrackingContext.create(camera, CONFIG).tracks_patches
-    assert TrackingContext.create(corridor.camera.left_camera(), CONFIG).tracks_patches
-    assert TrackingContext.create(corridor.camera, Config()).tracks_patches
-    assert not TrackingContext.create(corridor.camera.left_camera(), Config()).tracks_patches
-    assert not TrackingContext.create(corridor.camera, FEATURES).tracks_patches
+    assert not Context.create(camera, CONFIG).tracks_patches
+    assert Context.create(corridor.camera.left_camera(), CONFIG).tracks_patches
+    assert Context.create(corridor.camera, Config()).tracks_patches
+    assert not Context.create(corridor.camera.left_camera(), Config()).tracks_patches
+    assert not Context.create(corridor.camera, FEATURES).tracks_patches

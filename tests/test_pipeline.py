@@ -22,11 +22,11 @@ import numpy as np
 import pytest
 
 from vslam.config import Config
+from vslam.context import Context
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import parse_perturbation, perturbed
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.features import TrackingState
-from vslam.frontend.tracking import TrackingContext
 from vslam.loops import LoopEdge
 from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
@@ -85,7 +85,7 @@ def test_same_bytes_with_any_number_of_threads(kitti_tree):
 def test_both_cameras_at_once_are_prepared_to_the_same_bytes(kitti_tree, monocular):
     sequence = open_sequence("kitti", kitti_tree, "00", monocular=monocular)
     law = parse_perturbation("brightness:1", 0)
-    context = TrackingContext.create(sequence.camera, Config())
+    context = Context.create(sequence.camera, Config())
     met = threading.Barrier(1 if monocular else 2, timeout=60.0)
 
     def at_once(function, sides):

@@ -11,11 +11,11 @@ from test_relocalization import KEYFRAMES, lost_frame, mapped_street
 from test_verification import forward
 
 from vslam.config import Config
+from vslam.context import Context
 from vslam.features import TrackingState
 from vslam.frontend.frame import Frame
 from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.tracker import Found
-from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp, se3_log
 from vslam.loops import LastSeen, Localisation, LoopCandidate
 from vslam.map import Map
@@ -68,7 +68,7 @@ class Place:
             assert map_ is world.map
             return candidates
 
-        context = TrackingContext.create(CAMERA, config)
+        context = Context.create(CAMERA, config)
         return cls(world, frame, Relocaliser(context, locate, recognise), candidates)
 
     def check(self, found: Found) -> Found:

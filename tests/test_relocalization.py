@@ -8,14 +8,14 @@ from test_local_mapping import CAMERA, World, make_world
 from test_verification import forward, in_strip, link_pass
 
 from vslam.config import Config, RelocalizationConfig
+from vslam.context import Context
 from vslam.features import Extracted, Features
 from vslam.frontend.frame import Frame
 from vslam.frontend.relocaliser import relocalise
-from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp, se3_log
 from vslam.map_view import local_map
 
-CONTEXT = TrackingContext.create(CAMERA, Config())
+CONTEXT = Context.create(CAMERA, Config())
 KEYFRAMES = 4
 
 
@@ -114,6 +114,6 @@ def test_one_object_that_looks_the_same_brings_inliers_but_is_no_place():
     frame = lost_frame(world, forward(1.2, 0.3), among=in_strip(world, 200, 390))
     assert find(world, frame) == 0
     config = Config(relocalization=RelocalizationConfig(min_elsewhere=0))
-    context = TrackingContext.create(CAMERA, config)
+    context = Context.create(CAMERA, config)
     place, surroundings = local_map(world.map, 1, 1), local_map(world.map, 1, 80)
     assert relocalise(frame, place, surroundings, context, 0) >= 50

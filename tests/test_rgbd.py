@@ -14,6 +14,7 @@ from source_files import run_source
 from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import Config, DepthConfig, KeyframeConfig
+from vslam.context import Context
 from vslam.datasets import open_sequence
 from vslam.datasets.association import Pairing, associate
 from vslam.datasets.perturbation import parse_perturbation
@@ -26,7 +27,6 @@ from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.keyframes import KeyframeEvidence, needs_keyframe
-from vslam.frontend.tracking import TrackingContext
 from vslam.maps.storage import load_map, save_map
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
@@ -118,7 +118,7 @@ def test_columns_are_those_of_a_virtual_right_camera():
 
 def test_features_without_depth_are_monocular(corridor):
     camera = replace(corridor.camera, depth=True)
-    context = TrackingContext.create(camera, Config())
+    context = Context.create(camera, Config())
     depth = corridor_depth(camera, corridor.T_wc[0]).astype(np.float32)
     depth[:, :240] = 0.0
     extracted = FrameImages(corridor.left[0], lambda: depth, context).extracted
@@ -136,7 +136,7 @@ def test_matches_are_not_aligned_if_the_depth_image_cannot_be_read(corridor):
     def read_depth():
         raise UnreadableImageError(Path("depth.png"), "cannot be decoded; download it again.")
 
-    context = TrackingContext.create(replace(corridor.camera, depth=True), Config())
+    context = Context.create(replace(corridor.camera, depth=True), Config())
     extracted = FrameImages(corridor.left[0], read_depth, context).extracted
     assert np.isnan(extracted.features.u_right).all()
     assert extracted.pyramid is None

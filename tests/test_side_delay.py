@@ -12,10 +12,10 @@ from scipy.ndimage import gaussian_filter, shift
 
 from vslam.camera import Camera
 from vslam.config import Config
+from vslam.context import Context
 from vslam.features import Extracted, Features
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.side_delay import EVERY, DelayState, SideDelay
-from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp
 from vslam.image_motion import columns_without_delay, rays, row_speeds
 from vslam.run.rig import delay_warnings
@@ -200,7 +200,7 @@ def test_rows_are_measured_to_a_fraction_of_a_pixel(rows):
     rough = gaussian_filter(np.random.default_rng(0).normal(size=(200, 420)), 1.5)
     grey = np.clip(110 + 35 * rough / rough.std(), 0, 255)
     left, right = grey[:, :400], shift(grey, (rows, -7.3), order=3, mode="nearest")[:, :400]
-    context = TrackingContext.create(CAMERA, Config())
+    context = Context.create(CAMERA, Config())
     images = FrameImages(left.astype(np.uint8), lambda: right.astype(np.uint8), context)
     extracted = images.extracted
     assert extracted.row_offset is not None

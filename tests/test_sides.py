@@ -11,9 +11,9 @@ from scipy.ndimage import gaussian_filter
 
 from vslam.camera import Camera
 from vslam.config import Config
+from vslam.context import Context
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.sides import ComparedSides, Sides, balanced, compare_sides
-from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, se3_exp
 from vslam.run.rig import RigResiduals, measure_rig, residual_warnings, rig_warnings
 
@@ -150,7 +150,7 @@ def test_video_of_limited_range_needs_other_limits():
 def test_disparities_stay_true_when_a_side_is_dark(stops):
     """Without the correction, a side that is two stops darker gives few and wrong matches."""
     left, right = scene()
-    context = TrackingContext.create(CAMERA, Config())
+    context = Context.create(CAMERA, Config())
     clean, dark = (
         FrameImages(left, partial(darker, right, by), context).extracted.features
         for by in (0.0, stops)

@@ -9,8 +9,8 @@ import pytest
 from parts import ALL, CAMERA, Points, frame_of
 
 from vslam.config import Config
+from vslam.context import Context
 from vslam.frontend.frame import Frame
-from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import se3_exp, se3_log, transform
 from vslam.starter import OneViewStart, Starter, TwoViewStart
 
@@ -21,7 +21,7 @@ ASIDE = np.array([-1.0, 0.0, 0.1, 0.0, 0.01, 0.0])  # twist to a view from which
 
 def starter(camera=LEFT_CAMERA, **thresholds: float) -> Starter:
     config = Config.model_validate({"initialization": thresholds})
-    return Starter(TrackingContext.create(camera, config))
+    return Starter(Context.create(camera, config))
 
 
 def frame(

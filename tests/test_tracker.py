@@ -9,21 +9,17 @@ import pytest
 from parts import ALL, CAMERA, NOTHING, OneKeyframe, Points, ahead, frame_of
 
 from vslam.config import Config
+from vslam.context import Context
 from vslam.features import NO_PATCHES, Features, TrackingState
 from vslam.frame_poses import FramePoses
 from vslam.frontend.frame import Frame
 from vslam.frontend.patch_tracking import NO_PATCHES_FOUND, PatchTrack
 from vslam.frontend.tracker import Found, Tracker, TrackerStatus, judge
-from vslam.frontend.tracking import (
-    TrackingContext,
-    track_descriptors,
-    track_motion,
-    trusted_landmarks,
-)
+from vslam.frontend.tracking import track_descriptors, track_motion, trusted_landmarks
 from vslam.geometry import se3_exp
 from vslam.map_view import NO_LANDMARKS, MapView
 
-CONTEXT = TrackingContext.create(CAMERA, Config())
+CONTEXT = Context.create(CAMERA, Config())
 POINTS = Points.create()
 SEEN_LAST, SEEN_NOW = slice(0, 120), slice(120, 240)  # two halves of the points
 FEW = slice(0, 60)
@@ -338,7 +334,7 @@ def test_few_inliers_make_a_frame_weak_or_lost(n_matches, n_inliers, state):
     (40, TrackingState.OK), (39, TrackingState.LOST),
 ])  # fmt: skip
 def test_a_small_share_of_inliers_makes_a_frame_of_a_depth_camera_lost(n_inliers, state):
-    context = TrackingContext.create(replace(CAMERA, depth=True), Config())
+    context = Context.create(replace(CAMERA, depth=True), Config())
     assert judge(200, n_inliers, context) == state
 
 

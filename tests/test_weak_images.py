@@ -8,10 +8,10 @@ import pytest
 
 from vslam.camera import Camera
 from vslam.config import Config, OrbConfig, TrackingConfig, WeakImageConfig
+from vslam.context import Context
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.orb import extract
 from vslam.frontend.stereo import inliers_only, match_stereo
-from vslam.frontend.tracking import TrackingContext
 from vslam.frontend.weak_images import (
     LEAST_SPIKE,
     ROW_STRIDE,
@@ -153,7 +153,7 @@ def test_raised_contrast_is_that_of_the_configuration():
 
 def test_a_black_right_side_leaves_the_left_one_as_it_is():
     left = camera_image(scene()[0])
-    context = TrackingContext.create(CAMERA, CONFIG)
+    context = Context.create(CAMERA, CONFIG)
     features = FrameImages(left, lambda: np.zeros_like(left), context).extracted.features
     plain = extract(left, ORB)
     assert features.xy.tobytes() == plain.xy.tobytes()

@@ -23,6 +23,7 @@ from vslam.backend.disparity_offset import map_and_calibrate, offset_sigma
 from vslam.backend.local_mapping import refresh_keyframe
 from vslam.backend.triangulation import map_stereo_points
 from vslam.closing import LoopClosing, LoopSearch
+from vslam.context import Context
 from vslam.features import FramePatches
 from vslam.frame_poses import FramePoses, FrameTable
 from vslam.frontend.frame import Frame, PlacedFrame
@@ -33,7 +34,6 @@ from vslam.frontend.patches import (
     patches_of_landmarks,
 )
 from vslam.frontend.rig import RigCalibration
-from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, inverse, orthonormalised
 from vslam.hypotheses import part_of
 from vslam.map import Map
@@ -74,7 +74,7 @@ class Mapper:
 
     def __init__(
         self,
-        context: TrackingContext,
+        context: Context,
         closing: LoopClosing,
         rig: RigCalibration,
         workers: Workers,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from vslam.context import Context
 from vslam.frontend.frame import PlacedFrame
 from vslam.frontend.keyframes import KeyframeEvidence, KeyframePolicy
 from vslam.frontend.tracker import Found, Tracker
-from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, orthonormalised, se3_log
 from vslam.mapping import Mapper
 from vslam.starter import OneViewStart, Starter
@@ -83,7 +83,7 @@ class MapBuilding(Mode):
 
     changes_map = True
 
-    def __init__(self, context: TrackingContext, mapper: Mapper, tracker: Tracker) -> None:
+    def __init__(self, context: Context, mapper: Mapper, tracker: Tracker) -> None:
         super().__init__(mapper)
         self.starter = Starter(context)
         self.policy = KeyframePolicy(context)

@@ -10,11 +10,11 @@ import numpy as np
 from vslam.camera import same_camera
 from vslam.closing import LoopClosing
 from vslam.config import changed_thresholds
+from vslam.context import Context
 from vslam.features import TrackResult
 from vslam.frame_poses import FrameTable
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Tracker
-from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import inverse, orthonormalised, se3_log
 from vslam.map import Map
 from vslam.mapping import Mapper
@@ -49,7 +49,7 @@ class OpenedMap:
 
 def open_map(
     stored: StoredMap | None,
-    context: TrackingContext,
+    context: Context,
     closing: LoopClosing,
     *,
     localize: bool,
@@ -96,7 +96,7 @@ def open_map(
 class Session:
     """The parts of SLAM that have a state between frames, and the map in which the drive began."""
 
-    context: TrackingContext
+    context: Context
     closing: LoopClosing
     mapper: Mapper
     tracker: Tracker

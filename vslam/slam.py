@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vslam.camera import Camera, DepthImage, Image, check_images, check_mask
 from vslam.closing import LoopClosing
 from vslam.config import Config, as_config
+from vslam.context import Context
 from vslam.errors import InputError
 from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.extraction import FrameImages
@@ -22,7 +23,7 @@ from vslam.frontend.masks import Mask
 from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracker import Found, Tracker, TrackerStatus, result_of
-from vslam.frontend.tracking import TrackingContext, uncertainty_of
+from vslam.frontend.tracking import uncertainty_of
 from vslam.gaps import Gap, find_gaps
 from vslam.geometry import Matrix, adjoint, inverse
 from vslam.loopclosure.detector import LoopDetector
@@ -113,7 +114,7 @@ class Slam:
         config = as_config({} if config is None else config)
         if isinstance(detector, str):
             detector, images = detector_with_images(detector, config)
-        self.context = context = TrackingContext.create(camera, config)
+        self.context = context = Context.create(camera, config)
         self.detector = detector
         self.rig = rig = RigCalibration(camera, config.stereo, context.scales)
         verifier = verifier_for(config, camera, images)

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.two_views import adjust_two_views
+from vslam.context import Context
 from vslam.frontend.frame import Frame, PlacedFrame
 from vslam.frontend.initialization import match_views, reconstruct
-from vslam.frontend.tracking import TrackingContext
 from vslam.geometry import Matrix, se3_log
 
 
@@ -80,7 +80,7 @@ Start = OneViewStart | TwoViewStart
 class Starter:
     """Finds the frames with which a map or a sub-map can begin."""
 
-    def __init__(self, context: TrackingContext) -> None:
+    def __init__(self, context: Context) -> None:
         self._context = context
         self._first: Frame | None = None
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, DepthImage, Image
 from vslam.config import Config
+from vslam.context import Context
 from vslam.datasets.frames import Source
 from vslam.doctor import checks
 from vslam.doctor.findings import Finding, judge, sections
@@ -22,7 +23,6 @@ from vslam.doctor.focal_length import Moved, fit_focal_length
 from vslam.errors import UnreadableImageError, counted, write_file
 from vslam.frontend.extraction import find_corners
 from vslam.frontend.masks import Mask
-from vslam.frontend.tracking import TrackingContext
 from vslam.report.page import Figure, Page, Section
 from vslam.report.render import html
 from vslam.run.matching import Matches, joined, match_images
@@ -110,7 +110,7 @@ def examine(sequence: Source, config: Config) -> Diagnosis:
 
 
 def _count_features(sequence: Source, lefts: dict[int, Image], config: Config) -> list[int]:
-    context = TrackingContext.create(sequence.camera, config)
+    context = Context.create(sequence.camera, config)
     return [
         len(find_corners(left, None, context, mask=_mask_of(sequence, frame, config)).found.xy)
         for frame, left in lefts.items()

@@ -20,11 +20,11 @@ from typing import Generic, TypeVar
 
 from vslam.camera import DepthImage, Image, ImageMap
 from vslam.config import OrbConfig
+from vslam.context import Context
 from vslam.datasets.frames import TimedFrame
 from vslam.errors import DroppedFrameError, UnreadableImageError
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.masks import Mask
-from vslam.frontend.tracking import TrackingContext
 from vslam.workers import Job, Urgency, Workers
 
 T = TypeVar("T")
@@ -215,7 +215,7 @@ class PreparedFrame:
 
 def at_their_times(
     frames: Iterator[TimedFrame],
-    context: TrackingContext,
+    context: Context,
     workers: Workers,
     *,
     realtime: bool,
@@ -255,7 +255,7 @@ def at_their_times(
 
 def prepared_frames(
     frames: Iterator[TimedFrame],
-    context: TrackingContext,
+    context: Context,
     workers: Workers,
     begin: int = 0,
     next_extraction: Callable[[], int] = lambda: -1,
@@ -288,9 +288,7 @@ def prepared_frames(
             prepared.cancel()
 
 
-def prepare_frame(
-    frame: TimedFrame, context: TrackingContext, image_map: ImageMap = map
-) -> PreparedFrame:
+def prepare_frame(frame: TimedFrame, context: Context, image_map: ImageMap = map) -> PreparedFrame:
     """Read one frame and extract its features.
 
     Tracking by patches needs the right image and the features only for some frames. Therefore, only

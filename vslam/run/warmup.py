@@ -52,6 +52,7 @@ from vslam.backend.pose_graph import check_pose_graph, essential_graph, load_opt
 from vslam.camera import Camera
 from vslam.closing import LoopClosing
 from vslam.config import Config, DepthConfig, KeyframeConfig, MappingConfig, TrackingConfig
+from vslam.context import Context
 from vslam.datasets.png import unfilter
 from vslam.features import Extracted, Features
 from vslam.frontend import pnp
@@ -60,7 +61,6 @@ from vslam.frontend.frame import Frame
 from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
 from vslam.frontend.relocaliser import relocalise
 from vslam.frontend.rig import RigCalibration
-from vslam.frontend.tracking import TrackingContext
 from vslam.loopclosure import bow, local_matching, sim3_ransac
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.detector import NoDetector
@@ -245,7 +245,7 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
     verifier = verifier_for(config, CAMERA)
     closing = LoopClosing(NoDetector(), verifier, CAMERA, config, threads=1)
-    context = TrackingContext.create(CAMERA, config)
+    context = Context.create(CAMERA, config)
     rig = RigCalibration(CAMERA, config.stereo, context.scales)
     mapper = Mapper(context, closing, rig, Workers(1))
     rng = np.random.default_rng(0)
@@ -281,7 +281,7 @@ def compile_recognition() -> None:
     verify(map_, LoopCandidate(0, 0, 1.0), CAMERA, config.verification)
 
     place = local_map(map_, 0, 1)
-    context = TrackingContext.create(CAMERA, config)
+    context = Context.create(CAMERA, config)
     relocalise(Frame.of(Extracted(features), CAMERA), place, place, context, seed=0)
 
     detector = BowDetector(smallest_vocabulary())

@@ -150,18 +150,22 @@ def close_ratio(state: PolicyState, tracked_close: int, frame: int) -> float:
 
 
 class KeyframePolicy:
-    """Decides whether a tracked frame becomes a keyframe."""
+    """Decides whether a tracked frame becomes a keyframe.
+
+    Attributes:
+        state: what is known from the frames so far.
+    """
 
     def __init__(self, context: Context) -> None:
         self._context = context
         self._config = context.config.keyframes
         first = self._config.first_gain * self._config.min_tracked_close
-        self._state = PolicyState(first, gain_awaited=False)
+        self.state = PolicyState(first, gain_awaited=False)
 
     @property
     def due(self) -> int:
         """Index of the frame that is planned to become a keyframe; -1 if none is planned."""
-        return self._state.due
+        return self.state.due
 
     def observe(
         self, frame: Frame, view: MapView, *, seconds_since_keyframe: float, mapping_idle: bool
@@ -176,8 +180,8 @@ class KeyframePolicy:
             close = transform(frame.T_cw, frame.xyz)[:, 2] < self._context.close_depth
             untracked_close = None
         tracked_close = int(np.count_nonzero(close & tracked))
-        state = count_close(self._state, tracked_close, frame.index, self._config)
-        self._state = state
+        state = count_close(self.state, tracked_close, frame.index, self._config)
+        self.state = state
         return KeyframeEvidence(
             seconds_since_keyframe=seconds_since_keyframe,
             n_inliers=int(np.count_nonzero(tracked)),
@@ -232,20 +236,14 @@ class KeyframePolicy:
         if self.due < 0:
             soon = range(self._config.patch_lead_frames + 1)
             planned = (index + k for k in soon if self.wants_keyframe(evidence.ahead(k)))
-            self._state = replace(self._state, due=next(planned, -1))
+            self.state = replace(self.state, due=next(planned, -1))
         elif evidence.n_inliers < self._config.min_tracked_close and self.wants_keyframe(evidence):
-            self._state = replace(self._state, due=index)  # the plan came too late
+            self.state = replace(self.state, due=index)  # the plan came too late
         if not 0 <= self.due <= index:
             return False
-        self._state = replace(self._state, due=-1)
+        self.state = replace(self.state, due=-1)
         return True
 
     def reference_renewed(self) -> None:
         """Note that a keyframe was inserted, or that an existing one became the reference."""
-        self._state = replace(self._state, gain_awaited=True, due=-1)
-
-    def state(self) -> PolicyState:
-        return self._state
-
-    def restore(self, state: PolicyState) -> None:
-        self._state = state
+        self.state = replace(self.state, gain_awaited=True, due=-1)

@@ -18,10 +18,10 @@ from vslam.config import StereoConfig
 from vslam.features import shifted_columns
 from vslam.frontend.frame import Frame
 from vslam.frontend.side_delay import DelayState, SideDelay
-from vslam.frontend.sides import ComparedSides
+from vslam.frontend.sides import with_pair
 from vslam.geometry import Matrix
 from vslam.image_motion import columns_without_delay
-from vslam.states import RigState
+from vslam.states import ComparedSides, RigState
 
 
 class RigCalibration:
@@ -57,7 +57,7 @@ class RigCalibration:
         source = frame.source
         frame.extract(self._camera)
         if source is not None and source.sides is not None:
-            self.sides.add(source.sides)
+            self.sides = with_pair(self.sides, source.sides)
         if source is not None and source.problem is not None:
             self.problems.append(
                 f"Frame {frame.index} has only its left image: {source.problem.rstrip('.')}."
@@ -110,7 +110,7 @@ class RigCalibration:
     def state(self) -> RigState:
         """Return the measurements so far, for a map file or a checkpoint. The disparity offset is
         not included, because it is part of the map."""
-        return RigState(self.delay.state().numbers(), self.sides.numbers())
+        return RigState(self.delay.state().numbers(), self.sides)
 
     def restore(self, state: RigState) -> None:
         """Restore the measurements that ``state`` returned.
@@ -119,4 +119,4 @@ class RigCalibration:
             ValueError: the stored state is damaged.
         """
         self.delay.restore(DelayState.of_numbers(state.delay))
-        self.sides = ComparedSides.of_numbers(state.sides)
+        self.sides = state.sides

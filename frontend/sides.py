@@ -8,7 +8,7 @@ can therefore be estimated from the quantiles of all grey values.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import log2
 from typing import Literal
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import StereoConfig
+from vslam.states import ComparedSides
 
 Grey = NDArray[np.uint8]
 
@@ -47,40 +48,15 @@ class Sides:
     black: Literal["", "left", "right"] = ""
 
 
-@dataclass
-class ComparedSides:
-    """A summary of the differences in exposure of all stereo pairs of a drive.
-
-    Attributes:
-        n_black_left, n_black_right: number of stereo pairs whose left or right image was black.
-        darker_stops: all values of ``Sides.darker_stops`` that are not 0.
-    """
-
-    n: int = 0
-    n_black_left: int = 0
-    n_black_right: int = 0
-    darker_stops: list[float] = field(default_factory=list)
-
-    def add(self, sides: Sides) -> None:
-        self.n += 1
-        self.n_black_left += sides.black == "left"
-        self.n_black_right += sides.black == "right"
-        if sides.darker_stops:
-            self.darker_stops.append(sides.darker_stops)
-
-    def numbers(self) -> tuple[float, ...]:
-        """Convert the summary to numbers for a map file. ``of_numbers`` is the inverse."""
-        return (self.n, self.n_black_left, self.n_black_right, *self.darker_stops)
-
-    @classmethod
-    def of_numbers(cls, numbers: tuple[float, ...]) -> ComparedSides:
-        """Create a summary from the result of ``numbers``.
-
-        Raises:
-            ValueError: ``numbers`` is too short.
-        """
-        n, left, right, *darker = numbers
-        return cls(int(n), int(left), int(right), darker)
+def with_pair(compared: ComparedSides, sides: Sides) -> ComparedSides:
+    """Add a stereo pair to the summary of a drive."""
+    darker = (sides.darker_stops,) if sides.darker_stops else ()
+    return ComparedSides(
+        compared.n + 1,
+        compared.n_black_left + (sides.black == "left"),
+        compared.n_black_right + (sides.black == "right"),
+        compared.darker_stops + darker,
+    )
 
 
 def compare_sides(left: Grey, right: Grey, config: StereoConfig) -> Sides:

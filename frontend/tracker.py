@@ -549,8 +549,8 @@ def result_of(
         is_keyframe=is_keyframe,
         relocalised=found.relocalised,
         stage_ms=stage_ms,
-        T_odom_camera=odometry.T_odom_camera,
-        uncertainty=odometry.now,
+        T_odom_camera=odometry.state.T_odom_camera,
+        uncertainty=odometry.state.now,
         support=found.support,
         stands_still=found.stands_still,
     )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 
 from vslam.camera import Camera
@@ -17,7 +15,6 @@ from vslam.geometry import se3_exp, transform
 from vslam.map import Map
 from vslam.map_kernels import link_many
 from vslam.map_view import NO_LANDMARKS, LocalMap, local_map
-from vslam.maps.checkpoint import FEATURES
 
 CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.5, 640, 480)
 CONTEXT = Context.create(CAMERA, Config())
@@ -49,12 +46,6 @@ def place() -> LocalMap:
     ids = map_.add_landmarks(points(), descriptors().view(np.uint64), 0)
     link_many(map_.arrays, np.arange(N), ids)
     return local_map(map_, 0, 1)
-
-
-def test_features_are_a_table_and_a_checkpoint_keeps_all_of_it():
-    names = tuple(field.name for field in fields(Features))
-    assert names == ("xy", "octave", "angle", "descriptors", "u_right") == FEATURES
-    assert all(len(getattr(seen_from(T_CW), name)) == N for name in names)
 
 
 def test_the_pose_of_a_frame_is_refined_from_a_nearby_one_and_found_by_relocalisation():

@@ -96,7 +96,7 @@ def test_where_keyframes_bring_few_close_points_losing_most_of_those_makes_one()
 
 
 def test_that_close_points_are_few_by_nature_takes_several_keyframes_to_show():
-    state, means = policy().state(), []
+    state, means = policy().state, []
     for _ in range(6):
         state = count_close(replace(state, gain_awaited=True), 50, 1, CONFIG)
         state = count_close(state, 3, 2, CONFIG)  # later frames do not count
@@ -263,14 +263,14 @@ def test_deciding_changes_nothing(awaited):
     one = policy()
     if awaited:
         one.reference_renewed()
-    before = one.state()
+    before = one.state
     assert not one.wants_keyframe(CONTENT)
     assert one.wants_keyframe(replace(CONTENT, seconds_since_keyframe=1.0))
     assert not one.is_known(**KNOWN | {"n_shared": 0})
     assert one.is_known(**KNOWN)
-    assert one.state() == before
+    assert one.state == before
     observe(one, frame(close=10))
-    assert (one.state() != before) == awaited
+    assert (one.state != before) == awaited
 
 
 @pytest.mark.parametrize(("changes", "wanted"), [
@@ -311,18 +311,3 @@ def test_a_policy_decides_for_one_camera(changes, wanted):
 @pytest.mark.parametrize(("n_shared", "known"), [(100, True), (99, False)])
 def test_a_policy_knows_a_place_by_what_it_shares(n_shared, known):
     assert policy().is_known(**KNOWN | {"n_shared": n_shared}) == known
-
-
-@pytest.mark.parametrize("awaited", [True, False])
-def test_a_policy_that_is_restored_goes_on_as_the_one_that_was_not(awaited):
-    one = policy()
-    one.reference_renewed()
-    observe(one, frame(close=10))
-    if awaited:
-        one.reference_renewed()
-    other = policy()
-    other.restore(one.state())
-    assert other.state() == one.state()
-    gains = [observe(each, frame(close=30)).gained_close for each in (one, other)]
-    assert gains[0] == gains[1]
-    assert gains[0] == pytest.approx(135.6 if awaited else 162.0)

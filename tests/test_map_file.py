@@ -403,6 +403,10 @@ def test_damage_by_hand_is_refused(apply, file, tmp_path):
     assert "damaged" in refusal(apply(file, tmp_path / "hand.npz"))
 
 
+TRACKER, PLACE = "checkpoint.tracker", "checkpoint.mapper.known_place"
+FAR = {"keyframes": [10**6], "length": 1, "age": 0}
+
+
 @pytest.fixture(scope="module")
 def at_checkpoint(slam, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("checkpoint") / "ring.npz"
@@ -440,7 +444,7 @@ def same(one: object, other: object) -> bool:
 def entry(part: str, **fields: object):
     def apply(file: Path, to: Path) -> Path:
         header = header_of(file)
-        header["checkpoint"][part] |= fields
+        header["checkpoint"]["state"][part] |= fields
         return changed(file, to, header=as_header(header))
 
     return pytest.param(apply, id=next(iter(fields)))
@@ -469,12 +473,12 @@ def alive_that_died(file: Path, to: Path) -> Path:
 @pytest.mark.parametrize(
     "apply",
     [
-        damage("checkpoint_landmark", (3,), 10**6),
-        damage("checkpoint_landmark", (3,), -2),
-        damage("checkpoint_xy", (3, 0), np.nan),
-        damage("checkpoint_xy", (3, 0), 1e30),
-        damage("checkpoint_octave", (3,), 8),
-        damage("checkpoint_u_right", (3,), np.inf),
+        damage(f"{TRACKER}.landmark", (3,), 10**6),
+        damage(f"{TRACKER}.landmark", (3,), -2),
+        damage(f"{TRACKER}.features.xy", (3, 0), np.nan),
+        damage(f"{TRACKER}.features.xy", (3, 0), 1e30),
+        damage(f"{TRACKER}.features.octave", (3,), 8),
+        damage(f"{TRACKER}.features.u_right", (3,), np.inf),
         damage("keyframe_alive", (1,), False),
         damage("landmark_merged_into", (0,), 10**6),
         entry("mapper", reference=10**6),
@@ -485,14 +489,15 @@ def alive_that_died(file: Path, to: Path) -> Path:
         entry("tracker", index=-1),
         entry("tracker", lost_frames=10**30),
         entry("tracker", timestamp=np.inf),
-        entry("tracker", twist=[1.0, 2.0]),
-        entry("tracker", T_cw=[[1.0]]),
         entry("tracker", n_tracked="many"),
         entry("tracker", unknown=1),
-        entry("closing", places=[[1]]),
-        entry("closing", places=[[[10**6], 1, 0]]),
-        entry("closing", turn=np.inf),
-        entry("closing", in_vain=np.nan),
+        entry("tracker", T_cw="checkpoint.tracker.twist"),
+        entry("tracker", T_cw=None),
+        entry("tracker", T_cw="nothing"),
+        entry("closing", consistency={"places": [[1]], "verified": [], "turn": 1}),
+        entry("closing", consistency={"places": [FAR], "verified": [], "turn": 1}),
+        entry("closing", consistency={"places": [], "verified": [], "turn": np.inf}),
+        entry("closing", verifier={"resting_until": 0, "failed_similarity": np.nan}),
         entry("policy", gained_close="many"),
         entry("policy", gained_close=np.inf),
         pytest.param(without_checkpoint, id="none"),
@@ -516,7 +521,7 @@ def test_the_patches_of_a_known_place_come_back(at_known_place, tmp_path):
     known_place = stored.checkpoint.mapper.known_place
     with np.load(at_known_place) as data:
         for name, values in known_place._asdict().items():
-            wanted = 2 if name == "frame" else data[f"checkpoint_place_{name}"]
+            wanted = 2 if name == "frame" else data[f"{PLACE}.{name}"]
             np.testing.assert_array_equal(values, wanted)
     save_map(tmp_path / "again.npz", stored, resumable=True)
     assert (tmp_path / "again.npz").read_bytes() == at_known_place.read_bytes()
@@ -525,12 +530,12 @@ def test_the_patches_of_a_known_place_come_back(at_known_place, tmp_path):
 @pytest.mark.parametrize(
     "apply",
     [
-        damage("checkpoint_place_landmark", (0,), 11),
-        damage("checkpoint_place_landmark", (9,), 10**6),
-        damage("checkpoint_place_landmark", (0,), -1),
-        damage("checkpoint_place_octave", (3,), 8),
-        damage("checkpoint_place_angle", (3,), np.inf),
-        damage("checkpoint_place_shift", (3, 0), np.nan),
+        damage(f"{PLACE}.landmark", (0,), 11),
+        damage(f"{PLACE}.landmark", (9,), 10**6),
+        damage(f"{PLACE}.landmark", (0,), -1),
+        damage(f"{PLACE}.octave", (3,), 8),
+        damage(f"{PLACE}.angle", (3,), np.inf),
+        damage(f"{PLACE}.shift", (3, 0), np.nan),
         entry("mapper", known_place=3),
         entry("mapper", known_place="last"),
     ],
@@ -539,22 +544,20 @@ def test_damaged_patches_of_a_known_place_are_refused(apply, at_known_place, tmp
     assert "damaged" in refusal(apply(at_known_place, tmp_path / "hand.npz"))
 
 
-def test_a_checkpoint_of_an_earlier_version_has_no_known_place(at_checkpoint, tmp_path):
+def test_a_checkpoint_of_another_version_is_refused(at_checkpoint, tmp_path):
     header = header_of(at_checkpoint)
-    del header["checkpoint"]["mapper"]["known_place"]
+    header["checkpoint"] = header["checkpoint"]["state"]  # as before checkpoints had a schema
     older = changed(at_checkpoint, tmp_path / "older.npz", header=as_header(header))
-    assert load_checkpoint(older).checkpoint.mapper.known_place is None
+    assert refusal(older).endswith("another version of vslam; resume the run with that version.")
 
 
 def test_a_drive_that_has_made_no_keyframe_yet_is_resumed(at_checkpoint, tmp_path):
     """The drive began in the map of a different drive."""
     path = tmp_path / "m.npz"
     begun = {"last_frame": -1, "last_timestamp": -np.inf}
-    checkpoint = header_of(at_checkpoint)["checkpoint"]
-    checkpoint["mapper"] |= begun
-    changed(
-        at_checkpoint, path, header=as_header(header_of(at_checkpoint) | {"checkpoint": checkpoint})
-    )
+    header = header_of(at_checkpoint)
+    header["checkpoint"]["state"]["mapper"] |= begun
+    changed(at_checkpoint, path, header=as_header(header))
     mapper = load_checkpoint(path).checkpoint.mapper
     assert {name: getattr(mapper, name) for name in begun} == begun
 

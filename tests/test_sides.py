@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import partial, reduce
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,9 +13,10 @@ from vslam.camera import Camera
 from vslam.config import Config
 from vslam.context import Context
 from vslam.frontend.extraction import FrameImages
-from vslam.frontend.sides import ComparedSides, Sides, balanced, compare_sides
+from vslam.frontend.sides import Sides, balanced, compare_sides, with_pair
 from vslam.geometry import inverse, se3_exp
 from vslam.run.rig import RigResiduals, measure_rig, residual_warnings, rig_warnings
+from vslam.states import ComparedSides
 
 CONFIG = Config().stereo
 CAMERA = Camera(300.0, 300.0, 200.0, 100.0, 0.5, 400, 200)
@@ -180,10 +181,7 @@ def test_drives_have_clocks_of_their_own():
 
 
 def warned(each: list[Sides]) -> list[str]:
-    sides = ComparedSides()
-    for one in each:
-        sides.add(one)
-    return rig_warnings(ComparedSides.of_numbers(sides.numbers()))
+    return rig_warnings(reduce(with_pair, each, ComparedSides()))
 
 
 def test_warnings_say_what_was_seen_and_done():

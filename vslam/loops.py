@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,30 +161,6 @@ def reversed_loop(loop: LoopEdge) -> LoopEdge:
         features=None,
         landmarks=None,
     )
-
-
-def loop_entry(loop: LoopEdge) -> dict[str, Any]:
-    """Convert a loop edge to a JSON object, without its features and landmarks."""
-    entry = {name: value for name, value in vars(loop).items() if name not in _LEFT_OUT}
-    arrays = {name: entry[name] for name in _MATRICES}
-    return entry | {name: None if M is None else M.tolist() for name, M in arrays.items()}
-
-
-_LEFT_OUT = ("features", "landmarks")
-_MATRICES = {"T_query_match": (4, 4), "covariance": (6, 6)}
-
-
-def loop_of(entry: dict[str, Any]) -> LoopEdge:
-    """Read a loop edge from a JSON object that ``loop_entry`` returned.
-
-    Raises:
-        KeyError, TypeError, ValueError: the object does not describe a loop edge.
-    """
-    matrices = {
-        name: None if entry[name] is None else np.array(entry[name], np.float64).reshape(shape)
-        for name, shape in _MATRICES.items()
-    }
-    return LoopEdge(**{**entry, **matrices})
 
 
 @dataclass(frozen=True)

@@ -194,7 +194,7 @@ class MapBuilding(Mode):
         return False
 
     def state(self) -> PolicyState | None:
-        return None if self.starter.is_waiting else self.policy.state()
+        return None if self.starter.is_waiting else self.policy.state
 
     def restore(self, state: PolicyState) -> None:
-        self.policy.restore(state)
+        self.policy.state = state

@@ -49,7 +49,6 @@ DRIFT, CORRELATION = 1.4, 0.4
 ACCELERATION, TURNING, TURN_RATE, ANY_ROTATION, ANY_SPEED = 1.0, 1.0, 0.3, 1.0, 10.0
 
 N_NUMBERS = 70  # length of ``PoseUncertainty.numbers``
-N_STATE = 16 + N_NUMBERS + 1  # length of ``Odometry.state``
 _STEPS = 32  # into which ``predicted_covariance`` divides a motion
 _UPPER = np.triu_indices(6)
 
@@ -175,18 +174,32 @@ def _growth(n: int) -> float:
     return 1.0 + 2.0 * r / (1.0 - r) * (1.0 - (1.0 - r**n) / (n * (1.0 - r)))
 
 
-class Odometry:
-    """Follows the motion of the camera from frame to frame, and the uncertainty of its pose.
+@dataclass(frozen=True, eq=False)
+class OdometryState:
+    """State of the odometry.
 
     Attributes:
         T_odom_camera: ``(4, 4)`` pose of the last frame. The first frame is the origin.
         now: the uncertainty of this pose.
+        lost_s: seconds since tracking was lost; -1 before the first tracked frame.
+    """
+
+    T_odom_camera: Matrix = field(default_factory=lambda: np.eye(4))
+    now: PoseUncertainty = field(
+        default_factory=lambda: PoseUncertainty(np.zeros((6, 6)), np.zeros((6, 6)), 0)
+    )
+    lost_s: float = -1.0
+
+
+class Odometry:
+    """Follows the motion of the camera from frame to frame, and the uncertainty of its pose.
+
+    Attributes:
+        state: the pose of the last frame and its uncertainty.
     """
 
     def __init__(self) -> None:
-        self.T_odom_camera = np.eye(4)
-        self.now = PoseUncertainty(np.zeros((6, 6)), np.zeros((6, 6)), 0)
-        self._lost_s = -1.0  # seconds since tracking was lost; -1 before the first tracked frame
+        self.state = OdometryState()
 
     def move(
         self,
@@ -215,24 +228,26 @@ class Odometry:
             known_velocity: whether the velocity before the prediction was known. Otherwise, the
                 prediction is that the camera does not move.
         """
-        self.T_odom_camera = orthonormalised(self.T_odom_camera @ inverse(T_now_last))
-        A, now, before = adjoint(T_now_last), self.now, self._lost_s
+        T_odom_camera = orthonormalised(self.state.T_odom_camera @ inverse(T_now_last))
+        A, now, before = adjoint(T_now_last), self.state.now, self.state.lost_s
+        lost_s = before
         local, gaps = now.local, _symmetric(A @ now.gaps @ A.T)
         if covariance is not None and not np.isfinite(covariance).all():
             covariance = None
         if before >= 0.0 and (found_again or covariance is None):
-            self._lost_s += elapsed
+            lost_s += elapsed
             speed = 0.0 if known_velocity else ANY_SPEED
-            local = _predicted(local, A, before, self._lost_s, speed)
+            local = _predicted(local, A, before, lost_s, speed)
         if before >= 0.0 and found_again:
             gaps, local = gaps + local, np.zeros((6, 6))
         if covariance is not None:
-            local, self._lost_s = _symmetric(covariance), 0.0
+            local, lost_s = _symmetric(covariance), 0.0
         offset = A @ now.offset
         if of_offset is not None and np.isfinite(of_offset).all():
             offset += of_offset @ T_now_last[:3, 3]
         drift = _symmetric(A @ now.drift @ A.T)
-        self.now = PoseUncertainty(local, drift, now.n_keyframes, offset, gaps)
+        now = PoseUncertainty(local, drift, now.n_keyframes, offset, gaps)
+        self.state = OdometryState(T_odom_camera, now, lost_s)
 
     def keyframe(self) -> None:
         """Record that the last frame became a keyframe.
@@ -240,24 +255,9 @@ class Odometry:
         The error of the frame is added to the drift, because new landmarks inherit it. If the pose
         of the frame was predicted, the keyframe begins a sub-map, and the error is that of a gap.
         """
-        now, error = self.now, self.now.local
-        if self._lost_s == 0.0:
-            self.now = replace(now, drift=now.drift + error, n_keyframes=now.n_keyframes + 1)
-            return
-        self.now = replace(
-            now, local=np.zeros((6, 6)), n_keyframes=now.n_keyframes + 1, gaps=now.gaps + error
-        )
-        self._lost_s = 0.0
-
-    def resume(self, T_odom_camera: Matrix, uncertainty: PoseUncertainty) -> None:
-        """Continue from the last frame of a drive whose state was not saved."""
-        self.T_odom_camera, self.now, self._lost_s = T_odom_camera, uncertainty, 0.0
-
-    def state(self) -> tuple[float, ...]:
-        """Return the state of the odometry for a checkpoint."""
-        return (*self.T_odom_camera.ravel(), *self.now.numbers().tolist(), self._lost_s)
-
-    def restore(self, state: tuple[float, ...]) -> None:
-        """Restore a state that the method ``state`` returned."""
-        self.T_odom_camera = np.array(state[:16]).reshape(4, 4)
-        self.now, self._lost_s = PoseUncertainty.of_numbers(np.array(state[16:-1])), state[-1]
+        now = replace(self.state.now, n_keyframes=self.state.now.n_keyframes + 1)
+        if self.state.lost_s == 0.0:
+            now = replace(now, drift=now.drift + now.local)
+        else:
+            now = replace(now, local=np.zeros((6, 6)), gaps=now.gaps + now.local)
+        self.state = replace(self.state, now=now, lost_s=0.0)

@@ -20,7 +20,7 @@ from vslam.map import Map
 from vslam.mapping import Mapper
 from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.modes import Mode
-from vslam.odometry import Odometry
+from vslam.odometry import Odometry, OdometryState
 from vslam.states import Checkpoint
 
 _log = logging.getLogger(__name__)
@@ -146,7 +146,7 @@ class Session:
             policy,
             self.closing.state(),
             self.rig.state(),
-            self.odometry.state(),
+            self.odometry.state,
         )
 
     def restore(self, state: Checkpoint) -> None:
@@ -155,7 +155,7 @@ class Session:
         self.mode.restore(state.policy)
         self.closing.restore(state.closing)
         self.rig.restore(state.rig)
-        self.odometry.restore(state.odometry)
+        self.odometry.state = state.odometry
         landmark = state.tracker.landmark
         xyz = np.full((len(landmark), 3), np.nan)
         xyz[landmark >= 0] = self.mapper.map.arrays.xyz[landmark[landmark >= 0]]
@@ -166,7 +166,7 @@ class Session:
         T_odom_camera, uncertainty = last.T_odom_camera, last.uncertainty
         if T_odom_camera is None or uncertainty is None or self.opened.checkpoint is not None:
             return
-        self.odometry.resume(T_odom_camera, uncertainty)
+        self.odometry.state = OdometryState(T_odom_camera, uncertainty, 0.0)
 
     def resume(self) -> None:
         """If ``resume=True`` was passed to ``open_map``, continue the drive after its last frame.

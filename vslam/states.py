@@ -1,8 +1,7 @@
 """The state of each part of SLAM between two frames, apart from the map.
 
-Every part returns its state from ``state()`` and accepts it in ``restore(state)``. A run that
-continues from all these states and the map produces results that are byte-identical to the results
-of an uninterrupted run.
+A run that continues from all these states and the map produces results that are byte-identical to
+the results of an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from vslam.features import Features, FramePatches, KeyframePatches
 from vslam.geometry import Matrix
 from vslam.loops import LoopEdge, ResembledPlace
-from vslam.odometry import Odometry
+from vslam.odometry import OdometryState
 
 
 @dataclass(frozen=True)
@@ -145,29 +144,41 @@ class ClosingState:
 
 
 @dataclass(frozen=True)
+class ComparedSides:
+    """A summary of the differences in exposure of all stereo pairs of a drive.
+
+    Attributes:
+        n: number of stereo pairs.
+        n_black_left, n_black_right: number of stereo pairs whose left or right image was black.
+        darker_stops: all values of ``Sides.darker_stops`` that are not 0.
+    """
+
+    n: int = 0
+    n_black_left: int = 0
+    n_black_right: int = 0
+    darker_stops: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
 class RigState:
     """Measurements of a stereo rig.
 
     Attributes:
         delay: state of the estimator of the delay between the two cameras (``DelayState``).
-        sides: results of comparing the left and right images (``ComparedSides``).
+        sides: results of comparing the left and right images.
     """
 
     delay: tuple[float, ...] = ()
-    sides: tuple[float, ...] = (0.0, 0.0, 0.0)
+    sides: ComparedSides = field(default_factory=ComparedSides)
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The states of all parts of SLAM between two frames.
-
-    Attributes:
-        odometry: pose of the last frame and its uncertainty (``Odometry``).
-    """
+    """The states of all parts of SLAM between two frames."""
 
     tracker: TrackerState
     mapper: MapperState
     policy: PolicyState
     closing: ClosingState
     rig: RigState = field(default_factory=RigState)
-    odometry: tuple[float, ...] = field(default_factory=lambda: Odometry().state())
+    odometry: OdometryState = field(default_factory=OdometryState)

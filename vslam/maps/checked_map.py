@@ -26,7 +26,7 @@ from vslam.map import (
     Map,
     Scalars,
 )
-from vslam.maps.checkpoint import arrays_of, checked_checkpoint
+from vslam.maps.checkpoint import checked_checkpoint
 from vslam.maps.stored_map import StoredMap, TruthAlignment, observations
 from vslam.revisits import Revisits
 
@@ -116,10 +116,8 @@ def checked_map(data: dict[str, NDArray], header: dict[str, Any]) -> StoredMap:
     map_.revisits = _revisits(data, sizes)
     checkpoint = None
     if header["checkpoint"] is not None:
-        arrays = {name: data[f"checkpoint_{name}"] for name in arrays_of(header["checkpoint"])}
-        checkpoint = checked_checkpoint(
-            arrays, header["checkpoint"], map_, sizes["F"] if header["frames"] else 0
-        )
+        n_frames = sizes["F"] if header["frames"] else 0
+        checkpoint = checked_checkpoint(header["checkpoint"]["state"], data, map_, n_frames)
     else:
         a = map_.arrays
         living = bool(a.keyframe_alive.all() and a.landmark_alive.all())

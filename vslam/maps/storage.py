@@ -23,7 +23,8 @@ from vslam.frame_poses import FrameTable
 from vslam.machine import versions
 from vslam.map_kernels import gather_observations, resolve
 from vslam.maps.checked_map import FILE_NAMES, DamagedMapError, camera_of, checked_map
-from vslam.maps.checkpoint import checkpoint_arrays, checkpoint_entry
+from vslam.maps.checkpoint import CHECKPOINTS
+from vslam.maps.checkpoint import SCHEMA as CHECKPOINT_SCHEMA
 from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
 from vslam.untrusted import ARCHIVE_ERRORS, read_json, require_memory
@@ -79,6 +80,12 @@ def load_checkpoint(path: Path | str) -> StoredMap:
     path = map_file_of(path)
     data, header = _read(path)
     with _damage_reported(path):
+        state = header["checkpoint"]
+        if state is not None and state.get("schema") != CHECKPOINT_SCHEMA:
+            raise InputError(
+                f"{path}: has the state of a run by another version of vslam; resume the run with "
+                "that version."
+            )
         return checked_map(data, header)
 
 
@@ -91,7 +98,8 @@ def _damage_reported(path: Path) -> Iterator[None]:
 
 
 def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
-    map_, checkpoint = stored.map, stored.checkpoint
+    map_ = stored.map
+    state, of_state = CHECKPOINTS.encode(stored.checkpoint, "checkpoint")
     index = np.arange(map_.n_keyframes, dtype=np.int64)
     landmarks = np.arange(map_.n_landmarks, dtype=np.int32)
     first, rows = gather_observations(map_.arrays, landmarks, index)
@@ -116,7 +124,7 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
         "images": stored.images is not None,
         "frames": stored.frames is not None,
         "scalars": asdict(map_.scalars),
-        "checkpoint": None if checkpoint is None else checkpoint_entry(checkpoint),
+        "checkpoint": None if state is None else {"schema": CHECKPOINT_SCHEMA, "state": state},
         "world": None
         if stored.truth_alignment is None
         else {
@@ -142,14 +150,12 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
             [_UNKNOWN if loop.covariance is None else loop.covariance for loop in loops], np.float64
         ).reshape(-1, 6, 6),
         "revisit_landmark": resolve(map_.arrays, map_.revisits.landmark),
+        **of_state,
     }
     for name in vars(map_.revisits):
         arrays.setdefault(f"revisit_{name}", getattr(map_.revisits, name))
     for name in FrameTable._fields:
         arrays[f"frame_{name}"] = getattr(frames, name)
-    if checkpoint is not None:
-        for name, array in checkpoint_arrays(checkpoint).items():
-            arrays[f"checkpoint_{name}"] = array
     for name, table in stored.detector.tables.items():
         table = table.select(index)
         arrays[f"detector_{name}_first"] = table.first

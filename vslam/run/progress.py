@@ -11,22 +11,33 @@ import math
 from array import array
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.errors import InputError
 from vslam.features import TrackingState, TrackResult
-from vslam.loops import LoopCorrection, LoopEdge, loop_entry, loop_of
+from vslam.loops import LoopCorrection, LoopEdge
+from vslam.maps.checkpoint import LOOP_SHAPES
+from vslam.maps.codec import Codec
 from vslam.maps.new_output import replaced_file
 from vslam.odometry import N_NUMBERS, PoseUncertainty
 from vslam.untrusted import ARCHIVE_ERRORS, read_json, read_npz
 
-SCHEMA = 6
+SCHEMA = 7
 _STATES = tuple(TrackingState)
 _POSE, _NUMBERS = 16, 8 + 16 + N_NUMBERS  # columns of the pose, and of the numbers after it
 _UNKNOWN = np.full(N_NUMBERS, np.nan)
+PROGRESS = Codec(
+    LOOP_SHAPES
+    | {
+        "TrackTable.rows": ("N", _POSE + _NUMBERS),
+        "TrackTable.stage_ms": ("N", "S"),
+        "LoopCorrection.keyframes": ("N",),
+        "LoopCorrection.T_cw_before": ("N", 4, 4),
+        "LoopCorrection.T_cw_after": ("N", 4, 4),
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -186,30 +197,12 @@ def write_progress(path: Path, progress: Progress) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    header = {
-        "kind": "vslam progress",
-        "schema": SCHEMA,
-        "stages": progress.tracks.stages,
-        "skipped": progress.skipped,
-        "loops": [loop_entry(loop) for loop in progress.loops],
-        "corrections": [
-            {"edge": loop_entry(one.edge), "seconds": one.seconds} for one in progress.corrections
-        ],
-    }
-    arrays: dict[str, NDArray] = {
-        "header": np.frombuffer(
-            json.dumps(header, default=lambda number: number.item()).encode(), np.uint8
-        ),
-        "frames": progress.tracks.rows,
-        "stage_ms": progress.tracks.stage_ms,
-        "latency_ms": np.array(progress.latency_ms, np.float64),
-        "seconds": np.array([progress.wall_s, progress.cpu_s], np.float64),
-    }
-    for number, one in enumerate(progress.corrections):
-        arrays[f"correction_{number}_keyframes"] = one.keyframes
-        arrays[f"correction_{number}_T_cw"] = np.stack([one.T_cw_before, one.T_cw_after])
+    entry, arrays = PROGRESS.encode(progress, "progress")
+    header = json.dumps({"kind": "vslam progress", "schema": SCHEMA, "progress": entry})
     with replaced_file(path) as file:
-        np.savez(file, allow_pickle=False, **arrays)
+        np.savez(
+            file, allow_pickle=False, header=np.frombuffer(header.encode(), np.uint8), **arrays
+        )
 
 
 def read_progress(path: Path) -> Progress:
@@ -223,37 +216,13 @@ def read_progress(path: Path) -> Progress:
         header = read_json(arrays["header"])
         if header["kind"] != "vslam progress" or header["schema"] != SCHEMA:
             raise InputError(f"{path}: written by another version of vslam; resume with that one.")
-        wall_s, cpu_s = arrays["seconds"].tolist()
-        return Progress(
-            tracks=_checked_table(arrays["frames"], header["stages"], arrays["stage_ms"]),
-            skipped=[str(line) for line in header["skipped"]],
-            latency_ms=arrays["latency_ms"].tolist(),
-            wall_s=wall_s,
-            cpu_s=cpu_s,
-            loops=[loop_of(entry) for entry in header["loops"]],
-            corrections=[
-                _correction(entry, arrays, number)
-                for number, entry in enumerate(header["corrections"])
-            ],
-        )
-    except (*ARCHIVE_ERRORS, TypeError, IndexError) as error:
+        progress = PROGRESS.decode(Progress, header["progress"], arrays)
+        if progress.tracks.stage_ms.shape[1] != len(progress.tracks.stages):
+            raise ValueError("the stages do not match the frames")
+        progress.tracks.results()  # raises an error for an unknown state
+        return progress
+    except (*ARCHIVE_ERRORS, TypeError, AttributeError, IndexError) as error:
         raise InputError(f"{path}: damaged ({error}); there is nothing to resume.") from error
-
-
-def _correction(entry: dict[str, Any], arrays: dict[str, NDArray], number: int) -> LoopCorrection:
-    before, after = arrays[f"correction_{number}_T_cw"]
-    keyframes = arrays[f"correction_{number}_keyframes"]
-    return LoopCorrection(loop_of(entry["edge"]), keyframes, before, after, float(entry["seconds"]))
-
-
-def _checked_table(rows: NDArray, stages: list[str], stage_ms: NDArray) -> TrackTable:
-    if rows.dtype != np.float64 or rows.ndim != 2 or rows.shape[1] != _POSE + _NUMBERS:
-        raise ValueError("the frames are not rows of numbers")
-    if stage_ms.dtype != np.float64 or stage_ms.shape != (len(rows), len(stages)):
-        raise ValueError("the stages do not match the frames")
-    table = TrackTable(rows, tuple(map(str, stages)), stage_ms)
-    table.results()  # raises an error for an unknown state
-    return table
 
 
 def _track(index: int, row: NDArray[np.float64], stage_ms: dict[str, float]) -> TrackResult:

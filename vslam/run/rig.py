@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from vslam.camera import Camera, calibration_doubts
 from vslam.frontend.side_delay import SideDelay
-from vslam.frontend.sides import ComparedSides
 from vslam.geometry import compose, inverse, orthonormalised, se3_log
 from vslam.map import Map
+from vslam.states import ComparedSides
 
 _FEWEST = 3  # frames; fewer may be caused by a reflection or a hand in front of the lens
 _FEWEST_OBSERVATIONS, _MOST_OBSERVATIONS = 3_000, 100_000

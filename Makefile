@@ -7,6 +7,8 @@ VENV ?= .venv
 BIN := $(abspath $(VENV))/bin
 INSTALLED := $(VENV)/.installed
 DEVELOPED := $(VENV)/.developed
+# Two processes; a worker that has run out of tests takes some of the other's.
+PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal
 # Where torch for the CPU is; empty: take what pip finds.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
@@ -21,11 +23,11 @@ demo: $(INSTALLED)  ## drive a street by day and again by night: the default det
 	$(BIN)/vslam run --dataset synthetic --seq night --compare bow
 
 test: $(DEVELOPED)  ## run the tests, then the built wheel in a clean environment
-	$(BIN)/python -m pytest
+	$(PYTEST)
 	$(BIN)/python tools/wheel_test.py
 
 test-fast: $(DEVELOPED)  ## run the tests that are not marked slow: under two minutes
-	$(BIN)/python -m pytest -m 'not slow'
+	$(PYTEST) -m 'not slow'
 
 check: $(DEVELOPED)  ## check format, lint and types
 	$(BIN)/ruff format --check

@@ -19,7 +19,15 @@ from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import render_sequence
 from vslam.geometry import se3_exp
 from vslam.map import Map
+from vslam.run.warmup import compile_kernels
 from vslam.trajectory import write_kitti
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the kernels before several workers start, each of which would compile them."""
+    if config.getoption("numprocesses", None):
+        compile_kernels()
+
 
 METRES_PER_TEXEL = 0.02
 PLANES = (  # normal . X = offset in metres, in the world frame (x right, y down, z forward)

@@ -10,6 +10,8 @@ from pathlib import Path
 import numba
 import pytest
 
+from vslam.kernels import _CheckedFiles
+
 # A separate process prints the loaded modules of Numba's compiler, and then the result.
 INNER = """
 import sys
@@ -122,6 +124,16 @@ def test_damaged_kernels_are_compiled_again(tmp_path: Path, how: str, kind: str)
     assert errors.read_text().count("damaged; they are compiled again") == 1
     assert run(tmp_path, "-c", CALL)[0] == "6.0 [0.0, 1.0, 2.0, 3.0] 1"
     assert errors.read_text() == ""
+
+
+def test_signatures_that_two_processes_save_at_once_are_not_mixed_up(tmp_path, monkeypatch) -> None:
+    one, two, later = (_CheckedFiles(str(tmp_path), "kernel", 0) for _ in range(3))
+    read, write = two._load_index(), one._save_index
+    monkeypatch.setattr(two, "_load_index", lambda: read)  # before the first process saved its own
+    monkeypatch.setattr(one, "_save_index", lambda index: (write(index), two.save("int64", 64)))
+    one.save("int32", 32)
+    assert later.load("int32") in (32, None)
+    assert later.load("int64") == 64
 
 
 SMALL_DISK = """

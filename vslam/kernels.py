@@ -103,6 +103,13 @@ class _CheckedFiles(IndexDataCacheFile):
             _warn(_DAMAGED)
             return {}
 
+    def save(self, key: Any, data: Any) -> None:
+        # The number is that of the key, and the code is written first: whatever another process
+        # saves or loads at the same time, the index never names the code of another signature.
+        index, name = self._load_index(), self._data_name(zlib.crc32(repr(key).encode()))
+        self._save_data(name, data)
+        self._save_index(index | {key: name})
+
     def _save_data(self, name: str, data: Any) -> None:
         code = self._dump(data)
         with self._open_for_write(self._data_path(name)) as file:

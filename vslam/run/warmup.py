@@ -20,8 +20,8 @@ Monocular runs need no further kernels. Their initialisation, and the similarity
 their loops, are computed with NumPy.
 
 A kernel that both processes need is compiled by the process that calls it first. Both processes
-must call the kernel with the same types, because two processes can write to Numba's cache safely
-only if they write the same signature.
+must call the kernel with the same types. If two processes save different signatures of a kernel at
+the same time, one signature is lost and must be compiled again.
 """
 
 from __future__ import annotations

@@ -19,10 +19,11 @@ from vslam.features import PATCH_RADIUS, Features, Pyramid
 from vslam.frontend.alignment import find_patches
 from vslam.frontend.masks import Mask
 from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
-from vslam.frontend.standstill import MEASURE_SHARE, Standstill, is_small, still_stands
+from vslam.frontend.standstill import MEASURE_SHARE, is_small, still_stands
 from vslam.frontend.tracking import predict_landmarks, trusted_landmarks
 from vslam.geometry import Matrix, orthonormalised, transform
 from vslam.map_view import MapView
+from vslam.states import Standstill
 
 _MARGIN = PATCH_RADIUS + 2  # least distance of a patch centre from the border of its level, pixels
 

@@ -8,12 +8,8 @@ rest. Landmarks of a moving object do not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
-
-from vslam.geometry import Matrix
 
 STAY = 0.4  # largest motion of a static landmark, pixels of its octave; patches are found to 0.1 px
 BEGIN_SHARE = 0.8  # the camera has come to rest if this share of the landmarks did not move
@@ -27,40 +23,6 @@ FEWEST = 15
 # where at least this share of the landmarks went.
 MOVED_SHARE = 0.9
 MEASURE_SHARE = 0.25  # share of the landmarks that are enough to measure the pose of the camera
-
-
-@dataclass(frozen=True)
-class Standstill:
-    """Where N landmarks were in the image when the camera came to rest.
-
-    Attributes:
-        T_cw: ``(4, 4)`` pose of the camera (world to camera).
-        ids: ``(N,)`` int32 ids of the landmarks, sorted.
-        xy: ``(N, 2)`` float32 positions in pixels.
-        n_keyframes: number of keyframes of the map at that time. A new keyframe may change the ids.
-    """
-
-    T_cw: Matrix
-    ids: NDArray[np.int32]
-    xy: NDArray[np.float32]
-    n_keyframes: int
-
-    def flow(
-        self, ids: NDArray[np.int32], xy: NDArray[np.float32]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-        """Compute how far landmarks have moved in the image.
-
-        Args:
-            ids, xy: ``(M,)`` landmarks, and ``(M, 2)`` positions in pixels where they are seen now.
-
-        Returns:
-            ``(M,)`` bool, whether a landmark was seen when the camera came to rest, and ``(M, 2)``
-            pixels. The motion of a landmark that was not seen then has no meaning.
-        """
-        if not len(self.ids):
-            return np.zeros(len(ids), np.bool_), np.zeros((len(ids), 2), np.float32)
-        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
-        return self.ids[at] == ids, xy - self.xy[at]
 
 
 def is_small(flow: NDArray[np.floating], scale: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -23,7 +23,7 @@ from vslam.frontend.patch_tracking import (
 )
 from vslam.frontend.pose import MIN_TRUSTED
 from vslam.frontend.pose_alignment import align_pose, coarse_pyramid, coarse_shapes
-from vslam.frontend.standstill import Standstill, has_come_to_rest, is_small
+from vslam.frontend.standstill import has_come_to_rest, is_small
 from vslam.frontend.tracking import (
     track_descriptors,
     track_local_map,
@@ -34,7 +34,7 @@ from vslam.geometry import Matrix, inverse, orthonormalised, se3_exp, se3_log, t
 from vslam.loops import LastSeen
 from vslam.map_view import MapView
 from vslam.odometry import Odometry
-from vslam.states import TrackerState
+from vslam.states import Standstill, TrackerState
 
 # The prediction of the motion is wrong by at most this acceleration, m/s^2, in ordinary drives. A
 # pose that implies a larger one needs IMPLAUSIBLE^-1 times as many landmarks that agree with it.
@@ -396,10 +396,10 @@ class Tracker:
 
     def state(self) -> TrackerState | None:
         """Return the state for a checkpoint, or None before the first frame is tracked."""
-        last, still = self.last, self._standstill
+        last = self.last
         if last is None:
             return None
-        state = TrackerState(
+        return TrackerState(
             index=last.index,
             timestamp=last.timestamp,
             features=last.features,
@@ -409,15 +409,7 @@ class Tracker:
             lost_frames=self.lost_frames,
             n_tracked=self._n_tracked,
             coarse=np.empty(0, np.uint8) if last.coarse is None else last.coarse.pixels,
-        )
-        if still is None:
-            return state
-        return replace(
-            state,
-            T_cw_still=still.T_cw,
-            still_ids=still.ids,
-            still_xy=still.xy,
-            still_keyframes=still.n_keyframes,
+            standstill=self._standstill,
         )
 
     def restore(self, state: TrackerState, xyz: Matrix) -> Frame:
@@ -440,11 +432,7 @@ class Tracker:
         self.lost_frames, self._n_tracked = state.lost_frames, state.n_tracked
         if self.lost_frames:
             self.status = TrackerStatus.LOST
-        self._standstill = None
-        if state.T_cw_still is not None:
-            self._standstill = Standstill(
-                state.T_cw_still, state.still_ids, state.still_xy, state.still_keyframes
-            )
+        self._standstill = state.standstill
         return last
 
     def _track_previous_frame(self, frame: Frame, T_cw: Matrix, view: MapView) -> int:

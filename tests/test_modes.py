@@ -12,11 +12,10 @@ from test_mapper import Drive, at, begin_with_two_views, bytes_of_map, see_point
 from vslam.camera import Camera
 from vslam.features import TrackingState
 from vslam.frontend.frame import Frame
-from vslam.frontend.standstill import Standstill
 from vslam.frontend.tracker import Found, Tracker
 from vslam.map_frames import OldPlace
 from vslam.modes import MapBuilding, Mode
-from vslam.states import PolicyState
+from vslam.states import PolicyState, Standstill
 
 POINTS = Points.create()
 TWIST = np.array([0.0, 0.0, -2.0, 0.0, 0.0, 0.0])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vslam.frontend.standstill import Standstill, has_come_to_rest, is_small, still_stands
+from vslam.frontend.standstill import has_come_to_rest, is_small, still_stands
+from vslam.states import Standstill
 
 
 def first(n: int, of: int) -> np.ndarray:

@@ -608,7 +608,7 @@ def test_a_standstill_is_part_of_the_state():
     for field in fields(drive.tracker.state()):
         mine, theirs = (getattr(one.state(), field.name) for one in (other, drive.tracker))
         np.testing.assert_equal(mine, theirs, field.name)
-    np.testing.assert_array_equal(other.state().still_ids, np.arange(192))
+    np.testing.assert_array_equal(other.state().standstill.ids, np.arange(192))
     other.restore(moves.tracker.state(), POINTS.xyz)
     assert not other.stands_still
 

@@ -18,6 +18,40 @@ from vslam.odometry import OdometryState
 
 
 @dataclass(frozen=True)
+class Standstill:
+    """Where N landmarks were in the image when the camera came to rest.
+
+    Attributes:
+        T_cw: ``(4, 4)`` pose of the camera (world to camera).
+        ids: ``(N,)`` int32 ids of the landmarks, sorted.
+        xy: ``(N, 2)`` float32 positions in pixels.
+        n_keyframes: number of keyframes of the map at that time. A new keyframe may change the ids.
+    """
+
+    T_cw: Matrix
+    ids: NDArray[np.int32]
+    xy: NDArray[np.float32]
+    n_keyframes: int
+
+    def flow(
+        self, ids: NDArray[np.int32], xy: NDArray[np.float32]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Compute how far landmarks have moved in the image.
+
+        Args:
+            ids, xy: ``(M,)`` landmarks, and ``(M, 2)`` positions in pixels where they are seen now.
+
+        Returns:
+            ``(M,)`` bool, whether a landmark was seen when the camera came to rest, and ``(M, 2)``
+            pixels. The motion of a landmark that was not seen then has no meaning.
+        """
+        if not len(self.ids):
+            return np.zeros(len(ids), np.bool_), np.zeros((len(ids), 2), np.float32)
+        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        return self.ids[at] == ids, xy - self.xy[at]
+
+
+@dataclass(frozen=True)
 class TrackerState:
     """State of the tracker.
 
@@ -31,10 +65,7 @@ class TrackerState:
         n_tracked: number of landmarks that the frame tracked.
         coarse: ``(Q,)`` uint8 pixels of the small images of the frame (``coarse_levels``). The
             array is empty if the frame has no such images.
-        T_cw_still: ``(4, 4)`` pose at which the camera came to rest. None if the camera moves.
-        still_ids, still_xy: ``(S,)`` int32 landmarks and ``(S, 2)`` float32 positions in pixels
-            where they were seen then.
-        still_keyframes: number of keyframes of the map then.
+        standstill: what the camera saw when it came to rest. None if the camera moves.
     """
 
     index: int
@@ -46,10 +77,7 @@ class TrackerState:
     lost_frames: int
     n_tracked: int
     coarse: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
-    T_cw_still: Matrix | None = None
-    still_ids: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
-    still_xy: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 2), np.float32))
-    still_keyframes: int = 0
+    standstill: Standstill | None = None
 
 
 @dataclass(frozen=True)

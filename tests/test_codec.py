@@ -106,7 +106,6 @@ def test_numpy_numbers_become_python_numbers():
         {"points": [{"at": "missing", "weight": 1.0}]},
         {"points": [{"at": ["shape.points.0.at"], "weight": 1.0}]},
         {"points": [[1.0, 2.0]]},
-        {"scratch": "shape.points.0.at"},
     ],
 )
 def test_damaged_entries_are_refused(change):

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass
 from enum import Enum
+from functools import cache
 from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 T = TypeVar("T")
+_PLAIN = (int, float, bool, str)
 _MOST_COUNT = 2**31
 
 
@@ -29,7 +31,7 @@ class Codec:
     Attributes:
         shapes: shape of each array, such as ``{"Features.xy": ("N", 2)}``. Lengths with the same
             letter must be equal within an object. An array with the shape None is not stored, and
-            is read as None.
+            is read as None; its annotation is ``X | None``.
         most: upper bound of the absolute values of floating-point numbers. If it is None, numbers
             may also be infinite or NaN.
         unbounded: fields to which ``most`` does not apply, such as "Features.u_right".
@@ -49,22 +51,22 @@ class Codec:
         return self._entry(value, name, "", arrays), arrays
 
     def _entry(self, value: Any, path: str, field: str, arrays: dict[str, NDArray]) -> Any:
+        if value is None or type(value) in _PLAIN:  # most values
+            return value
         if isinstance(value, np.ndarray):
             if self.shapes[field] is None:
                 return None
             arrays[path] = value
             return path
         if is_dataclass(value) or hasattr(value, "_fields"):
-            kind = type(value)
             return {
-                name: self._entry(getattr(value, name), f"{path}.{name}", _of(kind, name), arrays)
-                for name in get_type_hints(kind)
+                name: self._entry(getattr(value, name), f"{path}.{name}", inner, arrays)
+                for name, (inner, _) in _fields(value.__class__).items()
             }
-        if isinstance(value, list | tuple):
-            return [self._entry(one, f"{path}.{k}", field, arrays) for k, one in enumerate(value)]
-        if isinstance(value, frozenset):
-            return sorted(value)
-        return value.item() if isinstance(value, np.generic) else value
+        if isinstance(value, list | tuple | frozenset):
+            items = sorted(value) if isinstance(value, frozenset) else value
+            return [self._entry(one, f"{path}.{k}", field, arrays) for k, one in enumerate(items)]
+        return value.item() if isinstance(value, np.generic) else value.value
 
     def decode(self, kind: type[T], entry: Any, arrays: Mapping[str, NDArray]) -> T:
         """Create an object of the type ``kind`` from untrusted JSON and arrays.
@@ -79,7 +81,9 @@ class Codec:
     def _value(self, kind: Any, entry: Any, field: str, arrays: Mapping[str, NDArray]) -> Any:
         origin, args = get_origin(kind), get_args(kind)
         if origin is UnionType:
-            return None if entry is None else self._value(args[0], entry, field, arrays)
+            if entry is None or self.shapes.get(field, ()) is None:
+                return None
+            return self._value(args[0], entry, field, arrays)
         if origin is np.ndarray:
             return self._checked(arrays[entry], get_args(args[1])[0], field)
         if origin in (list, tuple, frozenset):
@@ -88,12 +92,12 @@ class Codec:
             pairs = zip(kinds, entry, strict=True)
             return origin(self._value(one, item, field, arrays) for one, item in pairs)
         if is_dataclass(kind) or hasattr(kind, "_fields"):
-            hints = get_type_hints(kind)
-            if entry.keys() != hints.keys():
+            fields = _fields(kind)
+            if entry.keys() != fields.keys():
                 raise ValueError(f"{field} has other fields")
             values = {
-                name: self._value(hint, entry[name], _of(kind, name), arrays)
-                for name, hint in hints.items()
+                name: self._value(hint, entry[name], inner, arrays)
+                for name, (inner, hint) in fields.items()
             }
             self._check_shapes(kind, values)
             return kind(**values)
@@ -117,14 +121,16 @@ class Codec:
 
     def _check_shapes(self, kind: type, values: dict[str, Any]) -> None:
         sizes: dict[str, int] = {}
-        for name, array in values.items():
+        for name, (field, _) in _fields(kind).items():
+            array = values[name]
             if not isinstance(array, np.ndarray):
                 continue
-            shape = self.shapes[_of(kind, name)] or ()
+            shape = self.shapes[field]
+            assert shape is not None  # such an array is read as None
             pairs = zip(shape, array.shape, strict=False)
             wanted = (n if isinstance(n, int) else sizes.setdefault(n, found) for n, found in pairs)
             if len(shape) != array.ndim or array.shape != tuple(wanted):
-                raise ValueError(f"{_of(kind, name)} has shape {array.shape}")
+                raise ValueError(f"{field} has shape {array.shape}")
 
     def _bounded(self, numbers: NDArray | float, field: str) -> bool:
         if self.most is None or field in self.unbounded:
@@ -132,5 +138,8 @@ class Codec:
         return bool((np.abs(numbers) < self.most).all())
 
 
-def _of(kind: type, name: str) -> str:
-    return f"{kind.__name__}.{name}"
+@cache
+def _fields(kind: type) -> dict[str, tuple[str, Any]]:
+    """Return the names of the fields, each with the name of its class, and their types."""
+    hints = get_type_hints(kind)  # slow
+    return {name: (f"{kind.__name__}.{name}", hint) for name, hint in hints.items()}

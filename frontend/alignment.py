@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from vslam.config import AlignmentConfig
 from vslam.features import PATCH_RADIUS, PATCH_SIDE, LandmarkPatches, Pyramid
-from vslam.frontend.frame import Frame
 from vslam.frontend.patches import patches_around
+from vslam.frontend.track import Track
 from vslam.kernels import inner_kernel, kernel
 
 HALF = 4  # half width of the compared window, pixels
@@ -30,8 +30,8 @@ MIN_CORNERNESS = 0.05  # least determinant of the 2x2 normal matrix over its dia
 STILL = 0.03  # pixels; the iteration ends when a step is smaller
 
 
-def align_frame(
-    frame: Frame,
+def align_matches(
+    track: Track,
     known: LandmarkPatches,
     scales: NDArray[np.float64],
     intrinsics: NDArray[np.float64],
@@ -46,25 +46,25 @@ def align_frame(
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
 
     Returns:
-        ``(N, 2)`` float32, the new value of ``Frame.shift``: the offset from each feature to its
+        ``(N, 2)`` float32, the new value of ``Track.shift``: the offset from each feature to its
         aligned position, in full-resolution pixels. It is NaN where a match was not aligned. The
         result is None if the frame has no image pyramid or if no landmark has a patch.
     """
-    features = frame.features
-    if frame.pyramid is None or not len(known.ids):
+    features, pyramid = track.features, track.extracted.pyramid
+    if pyramid is None or not len(known.ids):
         return None
-    matched = np.flatnonzero(frame.landmark >= 0)
-    landmark = frame.landmark[matched]
+    matched = np.flatnonzero(track.landmark >= 0)
+    landmark = track.landmark[matched]
     at = np.minimum(np.searchsorted(known.ids, landmark), len(known.ids) - 1)
     same = known.ids[at] == landmark
     at, matched = at[same], matched[same]
     octave = features.octave[matched]
     found = find_patches(
-        frame.pyramid,
+        pyramid,
         features.xy[matched],
         octave,
-        frame.T_cw,
-        frame.xyz[matched],
+        track.T_cw,
+        track.xyz[matched],
         known,
         at,
         scales,

@@ -33,12 +33,15 @@ class Corners(NamedTuple):
         depth: ``(H, W)`` float32 depth image of an RGB-D camera, metres; None for other cameras.
         sides: result of comparing the exposure of the left and the right image; None without a
             right image.
+        problem: why the second image could not be read, so that only the left image is used; None
+            if there was no such problem.
     """
 
     found: Extraction
     matches: StereoMatches | None = None
     depth: DepthImage | None = None
     sides: Sides | None = None
+    problem: str | None = None
 
 
 class FrameImages:
@@ -51,10 +54,7 @@ class FrameImages:
         mask: the mask of the left image; None if all pixels are used.
         pyramid: the pyramid of the left image; None if frames are not tracked by patches.
         coarse: ``coarse_levels`` of ``pyramid``; None if ``pyramid`` is None.
-        sides: result of comparing the exposure of the left and the right image; None if there is no
-            right image, or if it has not been read.
-        problem: why the second image could not be read, so that only the left image is used; None
-            if there was no such problem.
+        sides, problem: see ``Corners``; None before ``corners`` is accessed.
     """
 
     def __init__(
@@ -94,9 +94,10 @@ class FrameImages:
     def corners(self) -> Corners:
         """The features that a corner detector finds, and their stereo matches. The first access
         reads the second image (right image or depth image)."""
-        if self._started is None:
-            return self._find_corners(self._image_map)
-        return self._started.result()
+        started = self._started
+        corners = self._find_corners(self._image_map) if started is None else started.result()
+        self.sides, self.problem = corners.sides, corners.problem
+        return corners
 
     @cached_property
     def extracted(self) -> Extracted:
@@ -115,14 +116,13 @@ class FrameImages:
         return self.left if self.mask is None else self.mask.filled(self.left)
 
     def _find_corners(self, image_map: ImageMap) -> Corners:
-        second = None
+        second, problem = None, None
         try:
             second = self._read_second()
         except UnreadableImageError as error:
-            self.problem = str(error)
+            problem = str(error)
         found = find_corners(self.left, second, self._context, image_map, self.mask, self.pyramid)
-        self.sides = found.sides
-        return found
+        return found._replace(problem=problem)
 
 
 def find_corners(
@@ -169,7 +169,7 @@ def matched(corners: Corners, context: Context, keypoints: Keypoints | None = No
             adds no features.
     """
     camera, config = context.camera, context.config
-    found, matches, depth, sides = corners
+    found, matches, depth, sides, _ = corners
     if sides is not None and sides.black == "left":
         return Extracted.nothing()
     # Without a pyramid, matches are not aligned. Depth cameras have a rolling shutter, which moves

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from vslam.camera import Camera
 from vslam.config import InitializationConfig
 from vslam.context import Context
-from vslam.frontend.frame import Frame
+from vslam.features import Features
 from vslam.frontend.matching import Projections, Searchable, consistent_orientation, search_windows
 from vslam.geometry import Matrix
 from vslam.reprojection import CHI2_MONO, stack_uvr
@@ -70,15 +70,15 @@ class TwoViews:
 
 
 def match_views(
-    one: Frame, two: Frame, context: Context
+    before: Features, now: Features, context: Context
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Match the features of two frames by their descriptors. Each feature of frame ``one`` is
-    searched for in a window around the same position in frame ``two``.
+    """Match the features of two frames by their descriptors. Each feature of the frame ``before``
+    is searched for in a window around the same position in the frame ``now``.
 
     Returns:
-        ``(N,)`` indices of the matched features in ``one``, and ``(N,)`` indices in ``two``.
+        ``(N,)`` indices of the matched features in ``before``, and ``(N,)`` indices in ``now``.
     """
-    config, before, now = context.config.initialization, one.features, two.features
+    config, camera = context.config.initialization, context.camera
     n = len(before)
     octave = before.octave.astype(np.int64)
     found, _ = search_windows(
@@ -89,7 +89,7 @@ def match_views(
             octave,
             before.descriptors.view(np.uint64),
         ),
-        Searchable.of_features(now, two.grid),
+        Searchable.of_features(now, camera.width, camera.height),
         np.ones(len(now), np.bool_),
         config.match_distance,
         config.match_ratio,

@@ -9,7 +9,7 @@ import numpy as np
 
 from vslam.config import KeyframeConfig
 from vslam.context import Context
-from vslam.frontend.frame import Frame
+from vslam.frontend.track import Track
 from vslam.frontend.tracking import feature_depth
 from vslam.geometry import transform
 from vslam.map_view import MapView
@@ -31,7 +31,7 @@ class KeyframeEvidence:
             that was tracked by patches and has no features; the number is then assumed to be large
             enough.
         mapping_idle: whether local mapping of the last keyframe is finished, and its result is
-            merged into the map that tracking reads.
+            visible to tracking.
         gained_close: number of close points that the first frame after a keyframe tracks, as a
             running mean over the last keyframes. It is infinite if unknown.
         first_close: number of close points that the first frame after the last keyframe tracks.
@@ -156,11 +156,11 @@ class KeyframePolicy:
         state: what is known from the frames so far.
     """
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, state: PolicyState | None = None) -> None:
         self._context = context
         self._config = context.config.keyframes
         first = self._config.first_gain * self._config.min_tracked_close
-        self.state = PolicyState(first, gain_awaited=False)
+        self.state = PolicyState(first, gain_awaited=False) if state is None else state
 
     @property
     def due(self) -> int:
@@ -168,19 +168,19 @@ class KeyframePolicy:
         return self.state.due
 
     def observe(
-        self, frame: Frame, view: MapView, *, seconds_since_keyframe: float, mapping_idle: bool
+        self, track: Track, view: MapView, *, seconds_since_keyframe: float, mapping_idle: bool
     ) -> KeyframeEvidence:
         """Update the state with a tracked frame. Returns the evidence for ``wants_keyframe``."""
-        tracked = frame.landmark >= 0
-        if frame.source is None:
-            depth = feature_depth(frame.features, self._context.camera)
-            close = depth < self._context.close_depth
-            untracked_close: int | None = int(np.count_nonzero(close & ~tracked))
+        tracked = track.landmark >= 0
+        untracked_close = None
+        if track.by_patches:
+            close = transform(track.T_cw, track.xyz)[:, 2] < self._context.close_depth
         else:
-            close = transform(frame.T_cw, frame.xyz)[:, 2] < self._context.close_depth
-            untracked_close = None
+            depth = feature_depth(track.features, self._context.camera)
+            close = depth < self._context.close_depth
+            untracked_close = int(np.count_nonzero(close & ~tracked))
         tracked_close = int(np.count_nonzero(close & tracked))
-        state = count_close(self.state, tracked_close, frame.index, self._config)
+        state = count_close(self.state, tracked_close, track.index, self._config)
         self.state = state
         return KeyframeEvidence(
             seconds_since_keyframe=seconds_since_keyframe,
@@ -191,7 +191,7 @@ class KeyframePolicy:
             mapping_idle=mapping_idle,
             gained_close=state.gained_close,
             first_close=state.first_close,
-            close_ratio=close_ratio(state, tracked_close, frame.index),
+            close_ratio=close_ratio(state, tracked_close, track.index),
         )
 
     def wants_keyframe(self, evidence: KeyframeEvidence) -> bool:

@@ -113,8 +113,9 @@ class Searchable(NamedTuple):
     grid: FeatureGrid
 
     @classmethod
-    def of_features(cls, features: Features, grid: FeatureGrid) -> Searchable:
-        """Create a ``Searchable`` without copying the arrays."""
+    def of_features(cls, features: Features, width: int, height: int) -> Searchable:
+        """Sort the features of an image of ``width`` by ``height`` pixels into a grid."""
+        grid = FeatureGrid.of_positions(features.xy, width, height)
         descriptor = features.descriptors.view(np.uint64)
         return cls(features.xy, features.octave, features.u_right, descriptor, grid)
 

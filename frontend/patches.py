@@ -23,7 +23,7 @@ from vslam.features import (
     Pyramid,
     level_pixel,
 )
-from vslam.frontend.frame import Frame
+from vslam.frontend.track import Track
 from vslam.geometry import Matrix
 from vslam.kernels import kernel
 from vslam.map import Map
@@ -61,35 +61,36 @@ def _cut(pixels, offsets, shapes, xy, octave):
 
 
 def _patches_of(
-    frame: Frame, chosen: NDArray[np.int64], scales: NDArray[np.float64]
+    track: Track, chosen: NDArray[np.int64], scales: NDArray[np.float64]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Return the patches around some features of a frame as ``KeyframePatches.pixels`` and
     ``shift``. The frame must have a pyramid."""
-    assert frame.pyramid is not None
-    octave, shift = frame.features.octave[chosen], np.zeros((len(chosen), 2), np.float32)
-    if frame.shift is not None:
-        aligned = frame.aligned[chosen]
-        shift[aligned] = frame.shift[chosen[aligned]] / scales[octave[aligned]][:, None]
-    return patches_around(frame.pyramid, frame.features.xy[chosen], octave), shift
+    pyramid = track.extracted.pyramid
+    assert pyramid is not None
+    octave, shift = track.features.octave[chosen], np.zeros((len(chosen), 2), np.float32)
+    if track.shift is not None:
+        aligned = track.aligned[chosen]
+        shift[aligned] = track.shift[chosen[aligned]] / scales[octave[aligned]][:, None]
+    return patches_around(pyramid, track.features.xy[chosen], octave), shift
 
 
-def patches_of_frame(frame: Frame, scales: NDArray[np.float64]) -> FramePatches | None:
+def patches_of_frame(track: Track, scales: NDArray[np.float64]) -> FramePatches | None:
     """Cut out the patches of the landmarks that a frame tracks. None if it has no pyramid.
 
     Args:
         scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
     """
-    if frame.pyramid is None:
+    if track.extracted.pyramid is None:
         return None
-    tracked = np.flatnonzero(frame.landmark >= 0)
-    landmark, first = np.unique(frame.landmark[tracked], return_index=True)
+    tracked = np.flatnonzero(track.landmark >= 0)
+    landmark, first = np.unique(track.landmark[tracked], return_index=True)
     tracked = tracked[first]
     return FramePatches(
-        frame.index,
+        track.index,
         landmark,
-        frame.features.octave[tracked],
-        frame.features.angle[tracked],
-        *_patches_of(frame, tracked, scales),
+        track.features.octave[tracked],
+        track.features.angle[tracked],
+        *_patches_of(track, tracked, scales),
     )
 
 
@@ -129,16 +130,16 @@ class RecentPatches:
         self._shift = np.empty((capacity, 0, 2), np.float32)
         self._next = 0
 
-    def remember(self, frame: Frame, keyframe: int, scales: NDArray[np.float64]) -> None:
+    def remember(self, track: Track, keyframe: int, scales: NDArray[np.float64]) -> None:
         """Store the patches around the features of a frame that became a keyframe.
 
         Args:
             keyframe: id of the new keyframe.
             scales: ``(levels,)`` full-resolution pixels per pixel of each octave.
         """
-        if frame.pyramid is not None:
-            everything = np.arange(len(frame.features))
-            self.add(KeyframePatches(keyframe, *_patches_of(frame, everything, scales)))
+        if track.extracted.pyramid is not None:
+            everything = np.arange(len(track.features))
+            self.add(KeyframePatches(keyframe, *_patches_of(track, everything, scales)))
 
     def add(self, patches: KeyframePatches) -> None:
         """Store the patches of one keyframe. If the store is full, they replace the patches of the
@@ -197,7 +198,7 @@ def _widened(array: NDArray, n: int) -> NDArray:
     return wide
 
 
-def certainty_of(frame: Frame, config: AlignmentConfig) -> NDArray[np.uint8] | int:
+def certainty_of(track: Track, config: AlignmentConfig) -> NDArray[np.uint8] | int:
     """Compute the ``(N,)`` uint8 certainty of the position of each feature (``Arrays.certainty``):
     the usual variance of a keypoint's position, divided by the variance of this position. It is 1
     for all features of a frame without a pyramid.
@@ -206,9 +207,9 @@ def certainty_of(frame: Frame, config: AlignmentConfig) -> NDArray[np.uint8] | i
     accurate, because its position defines the landmark that is created from it. The position of a
     match that was not aligned is wrong by about half a pixel.
     """
-    if frame.pyramid is None:
+    if track.extracted.pyramid is None:
         return 1
-    unaligned = (frame.landmark >= 0) & ~frame.aligned
+    unaligned = (track.landmark >= 0) & ~track.aligned
     return np.where(unaligned, 1, config.certainty).astype(np.uint8)
 
 

@@ -1,19 +1,20 @@
 """Tracks one frame against the map (ORB-SLAM2 paper, section III; ORB-SLAM paper, section V).
 
-All functions depend only on the frame, the previous frame and a ``LocalMap``. The map itself is
-never accessed, so local mapping can write to it at the same time.
+All functions depend only on the frame, the previous frame and a ``LocalMap``, and change none of
+them. The map itself is never accessed, so local mapping can write to it at the same time.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import DISPARITY_WEIGHT, Camera
 from vslam.context import Context
-from vslam.features import NO_PATCHES, Features, LandmarkPatches
-from vslam.frontend.alignment import align_frame
-from vslam.frontend.frame import Frame
+from vslam.features import NO_PATCHES, Features, LandmarkPatches, TrackingState
+from vslam.frontend.alignment import align_matches
 from vslam.frontend.masks import Mask
 from vslam.frontend.matching import (
     Projections,
@@ -25,6 +26,7 @@ from vslam.frontend.matching import (
 )
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.pose import MIN_TRUSTED, offset_effect, optimise_pose, pose_covariance
+from vslam.frontend.track import Track
 from vslam.geometry import Matrix, compose, inverse, transform
 from vslam.map_view import LocalMap
 from vslam.reprojection import stack_uvr
@@ -37,12 +39,8 @@ def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
 
 
 def track_motion(
-    frame: Frame,
-    previous: Frame,
-    T_cw: NDArray[np.float64],
-    local: LocalMap,
-    context: Context,
-) -> tuple[int, int]:
+    track: Track, previous: Track, T_cw: Matrix, local: LocalMap, context: Context
+) -> Track:
     """Track a frame against the points of the previous frame. The points are matched near their
     projections with the predicted pose, and the pose is optimised.
 
@@ -50,77 +48,64 @@ def track_motion(
     visual-odometry points of ORB-SLAM2).
 
     Args:
-        frame: receives the pose and the matches.
+        track: the frame with its features.
         T_cw: ``(4, 4)`` predicted pose (world to camera).
         local: tells which landmarks are confirmed.
 
     Returns:
-        Number of matches, and number of inliers of the pose optimisation.
+        The frame with its pose and its matches. ``n_inliers`` is 0 if too few points match.
     """
     config = context.config.tracking
-    matches, inliers = 0, 0
+    found = track
     for widening in (1.0, 2.0, 4.0):
         window = widening * context.motion_window
-        matches = _match_previous(frame, previous, T_cw, context, window, 1.0)
-        if matches < config.min_inliers_motion:
+        matched = _match_previous(track, previous, T_cw, context, window, 1.0)
+        if matched.n_matches < config.min_inliers_motion:
             continue
-        inliers = refine(frame, T_cw, local, context)
-        if inliers >= config.min_inliers_motion:
+        found = refine(matched, T_cw, local, context)
+        if found.n_inliers >= config.min_inliers_motion:
             break
-    return matches, inliers
+    return found
 
 
 def track_sudden_motion(
-    frame: Frame,
-    previous: Frame,
-    T_cw: NDArray[np.float64],
-    local: LocalMap,
-    context: Context,
-) -> tuple[int, int]:
+    track: Track, previous: Track, T_cw: Matrix, local: LocalMap, context: Context
+) -> Track:
     """Track a frame against the points of the previous frame, although the predicted pose is wrong.
 
     In a sudden turn, optimisation that starts at the predicted pose does not find the pose.
-    Therefore, the pose is first estimated by P3P inside RANSAC.
-
-    Args:
-        frame: receives the pose and the matches.
-        T_cw: ``(4, 4)`` predicted pose (world to camera).
-        local: tells which landmarks are confirmed.
-
-    Returns:
-        Number of matches, and number of inliers of the pose optimisation.
+    Therefore, the pose is first estimated by P3P inside RANSAC. Arguments and result are those of
+    ``track_motion``.
     """
     config = context.config.tracking
     least = config.min_inliers_motion
-    matches = _match_previous(
-        frame, previous, T_cw, context, config.sudden_window, config.match_ratio
+    matched = _match_previous(
+        track, previous, T_cw, context, config.sudden_window, config.match_ratio
     )
-    if matches < least:
-        return matches, 0
-    matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
+    if matched.n_matches < least:
+        return track
+    feature = np.flatnonzero(np.isfinite(matched.xyz[:, 0]))
     T_sampled, inlier = sampled_pose(
-        frame, matched, frame.xyz[matched], context, min_inliers=least, seed=frame.index
+        track.features, feature, matched.xyz[feature], context, min_inliers=least, seed=track.index
     )
     if np.count_nonzero(inlier) < least:
-        return matches, 0
-    frame.drop_matches(matched[~inlier])
-    return matches, refine(frame, T_sampled, local, context)
+        return track
+    return refine(matched.without(feature[~inlier]), T_sampled, local, context)
 
 
 def sampled_pose(
-    frame: Frame,
-    feature: NDArray[np.integer],
+    features: Features,
+    chosen: NDArray[np.integer],
     points: NDArray[np.float64],
     context: Context,
     *,
     min_inliers: int,
     seed: int,
 ) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Estimate the pose of a frame from N matches by P3P inside RANSAC (``ransac_pose``). The frame
-    is not changed.
+    """Estimate the pose of a frame from N matches by P3P inside RANSAC (``ransac_pose``).
 
     Args:
-        feature: ``(N,)`` indices of the matched features.
+        chosen: ``(N,)`` indices of the matched features.
         points: ``(N, 3)`` points of the matches, in the world frame.
         min_inliers: least number of inliers of an acceptable pose.
         seed: seed of the random samples.
@@ -132,7 +117,7 @@ def sampled_pose(
     config = context.config.relocalization
     return ransac_pose(
         points,
-        *observations(frame, feature, context),
+        *observations(features, chosen, context),
         context.camera.intrinsics,
         np.uint64(seed),
         min_inliers,
@@ -142,18 +127,9 @@ def sampled_pose(
 
 
 def _match_previous(
-    frame: Frame,
-    previous: Frame,
-    T_cw: NDArray[np.float64],
-    context: Context,
-    window: float,
-    ratio: float,
-) -> int:
-    """Match the points of the previous frame near their projections, and return the number of
-    matches.
-
-    If there are at least ``tracking.min_inliers_motion`` matches, they replace the matches of the
-    frame.
+    track: Track, previous: Track, T_cw: Matrix, context: Context, window: float, ratio: float
+) -> Track:
+    """Match the points of the previous frame near their projections.
 
     Args:
         window: search radius at octave 0, in pixels.
@@ -176,22 +152,20 @@ def _match_previous(
         low, high = np.zeros_like(octave), octave
     radius = np.where(ahead, window * context.scales[octave], 0.0)
     feature, point = _search(
-        frame,
+        track.features,
         Projections(uvr, radius, low, high, before.descriptors[source].view(np.uint64)),
-        np.ones(len(frame.features), np.bool_),
+        np.ones(len(track.features), np.bool_),
         context,
         ratio,
     )
-    keep = consistent_orientation(before.angle[source[point]], frame.features.angle[feature])
+    keep = consistent_orientation(before.angle[source[point]], track.features.angle[feature])
     feature, point = feature[keep], point[keep]
-    if len(feature) >= context.config.tracking.min_inliers_motion:
-        frame.drop_matches()
-        frame.match(feature, previous.landmark[source[point]], points[point])
-    return len(feature)
+    matched = track.without().matching(feature, previous.landmark[source[point]], points[point])
+    return replace(matched, n_matches=len(feature))
 
 
 def trackable_points(
-    previous: Frame, context: Context
+    previous: Track, context: Context
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the points that a frame observed: its landmarks and its other close stereo points.
 
@@ -209,102 +183,91 @@ def trackable_points(
 
 
 def match_descriptors(
-    frame: Frame, local: LocalMap, max_distance: int, ratio: float
+    features: Features, local: LocalMap, max_distance: int, ratio: float
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Match the features of a frame with landmarks, using only their descriptors (``search_all``).
+    """Match features with landmarks, using only their descriptors (``search_all``).
 
     Returns:
         ``(M,)`` indices of the matched features, and ``(M,)`` indices of their landmarks in
         ``local``.
     """
-    descriptors = frame.features.descriptors.view(np.uint64)
+    descriptors = features.descriptors.view(np.uint64)
     feature = search_all(local.descriptor, descriptors, max_distance, ratio)
     landmark = np.flatnonzero(feature >= 0)
     return feature[landmark], landmark
 
 
-def track_descriptors(
-    frame: Frame,
-    reference: LocalMap,
-    T_cw: NDArray[np.float64],
-    context: Context,
-) -> int:
+def track_descriptors(track: Track, reference: LocalMap, T_cw: Matrix, context: Context) -> Track:
     """Match landmarks using only their descriptors, without a predicted pose, and then optimise the
     pose.
 
     Args:
-        frame: receives the pose and the matches.
+        track: the frame with its features.
         reference: the landmarks of the reference keyframe.
-        T_cw: ``(4, 4)`` initial pose of the left camera for the optimisation (world to camera).
+        T_cw: ``(4, 4)`` initial pose for the optimisation (world to camera).
 
     Returns:
-        Number of inliers of the pose optimisation.
+        The frame with its pose and its matches. ``n_inliers`` is 0 if too few landmarks match.
     """
     config = context.config.tracking
     feature, landmark = match_descriptors(
-        frame, reference, config.reference_distance, config.reference_ratio
+        track.features, reference, config.reference_distance, config.reference_ratio
     )
-    frame.drop_matches()
     if len(feature) < config.min_inliers_lost:
-        return 0
-    frame.match(feature, reference.ids[landmark], reference.xyz[landmark])
-    before = frame.snapshot()
-    inliers = refine(frame, T_cw, reference, context)
-    T_sampled, sampled = sampled_pose(
-        before,
+        return track
+    points = reference.xyz[landmark]
+    matched = track.without().matching(feature, reference.ids[landmark], points)
+    found = refine(matched, T_cw, reference, context)
+    T_sampled, inlier = sampled_pose(
+        track.features,
         feature,
-        reference.xyz[landmark],
+        points,
         context,
-        min_inliers=max(inliers + 1, config.min_inliers_lost),
-        seed=frame.index,
+        min_inliers=max(found.n_inliers + 1, config.min_inliers_lost),
+        seed=track.index,
     )
-    if np.count_nonzero(sampled) <= inliers:
-        return inliers
+    if np.count_nonzero(inlier) <= found.n_inliers:
+        return found
     # The initial pose was so wrong that the pose of a moving object was nearer.
-    frame.restore(before)
-    frame.drop_matches(feature[~sampled])
-    return refine(frame, T_sampled, reference, context)
+    return refine(matched.without(feature[~inlier]), T_sampled, reference, context)
 
 
 def track_local_map(
-    frame: Frame,
+    track: Track,
     local: LocalMap,
     context: Context,
+    mask: Mask | None = None,
     window: float | None = None,
     patches: LandmarkPatches = NO_PATCHES,
-) -> tuple[int, int, NDArray[np.int32]]:
+) -> Track:
     """Match all landmarks of the local map that should be visible, align the matches to the image
     with sub-pixel accuracy, and optimise the pose.
 
     Args:
-        frame: receives the pose and the matches.
+        track: the frame with a first pose. Its matches are kept.
+        mask: the mask of the image; None uses all pixels.
         window: search radius at octave 0, pixels; None uses ``context.local_window``.
         patches: image patches of landmarks. Only the matches of these landmarks are aligned.
-
-    Returns:
-        Number of matches, number of inliers, and ``(V,)`` int32 ids of the landmarks that should be
-        visible.
     """
     config, intrinsics = context.config, context.camera.intrinsics
-    frame.xyz[frame.landmark < 0] = np.nan  # discard the points that are not in the map
-    tracked = np.isin(local.ids, frame.landmark[frame.landmark >= 0])
+    tracked = np.isin(local.ids, track.tracked)
     if window is None:
         window = context.local_window
-    uvr, radius, octave = predict_landmarks(frame.T_cw, local, window, frame.mask, context)
+    uvr, radius, octave = predict_landmarks(track.T_cw, local, window, mask, context)
     visible = radius > 0
     radius[tracked] = 0.0
     feature, landmark = _search(
-        frame,
+        track.features,
         Projections(uvr, radius, octave - 1, octave, local.descriptor),
-        frame.landmark < 0,
+        track.landmark < 0,
         context,
         config.tracking.match_ratio,
     )
-    frame.match(feature, local.ids[landmark], local.xyz[landmark])
-    matches = int(np.count_nonzero(frame.landmark >= 0))
-    shift = align_frame(frame, patches, context.scales, intrinsics, config.alignment)
-    inliers = refine(frame, frame.T_cw, local, context, shift)
-    return matches, inliers, local.ids[visible | tracked]
+    in_map = track.without(track.landmark < 0)  # without the points that are not in the map
+    matched = in_map.matching(feature, local.ids[landmark], local.xyz[landmark])
+    shift = align_matches(matched, patches, context.scales, intrinsics, config.alignment)
+    found = refine(matched, track.T_cw, local, context, shift)
+    return replace(found, n_matches=len(matched.tracked), visible=local.ids[visible | tracked])
 
 
 def predict_landmarks(
@@ -334,7 +297,7 @@ def predict_landmarks(
 
 
 def _search(
-    frame: Frame,
+    features: Features,
     projections: Projections,
     free: NDArray[np.bool_],
     context: Context,
@@ -342,39 +305,47 @@ def _search(
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Return the ``(M,)`` indices of the features that ``search_windows`` matches, and the ``(M,)``
     indices of their projections."""
-    features = Searchable.of_features(frame.features, frame.grid)
-    max_distance = context.config.tracking.match_distance
-    found, _ = search_windows(projections, features, free, max_distance, ratio)
+    camera, max_distance = context.camera, context.config.tracking.match_distance
+    searchable = Searchable.of_features(features, camera.width, camera.height)
+    found, _ = search_windows(projections, searchable, free, max_distance, ratio)
     matched = np.flatnonzero(found >= 0)
     return found[matched], matched
 
 
 def refine(
-    frame: Frame,
-    T_cw: NDArray[np.float64],
+    track: Track,
+    T_cw: Matrix,
     local: LocalMap,
     context: Context,
     shift: NDArray[np.float32] | None = None,
-) -> int:
-    """Optimise the pose of a frame using all its matches, drop the outliers, and return the number
-    of inliers.
+) -> Track:
+    """Optimise the pose of a frame using all its matches, and drop the outliers.
 
     Args:
         T_cw: ``(4, 4)`` initial pose (world to camera).
         local: tells which landmarks are confirmed.
-        shift: the new ``Frame.shift``; None if no match is aligned.
+        shift: ``Track.shift`` of the matches; None if no match is aligned.
     """
-    frame.shift = shift
-    matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
-    frame.T_cw, inlier = optimise_pose(
+    matched, track = np.flatnonzero(np.isfinite(track.xyz[:, 0])), replace(track, shift=shift)
+    T_found, inlier = optimise_pose(
         T_cw,
-        *_observed_points(frame, matched, context),
+        *_observed_points(track, matched, context),
         trusted=trusted_landmarks(
-            local.confirms(frame.landmark[matched]), frame.xyz[matched], T_cw, context
+            local.confirms(track.landmark[matched]), track.xyz[matched], T_cw, context
         ),
     )
-    frame.drop_matches(matched[~inlier])
-    return int(np.count_nonzero(inlier))
+    inliers = track.without(matched[~inlier])
+    return replace(inliers, T_cw=T_found, n_inliers=int(np.count_nonzero(inlier)))
+
+
+def judge(n_matches: int, n_inliers: int, context: Context) -> TrackingState:
+    """Decide from the number of matches and of inliers whether the pose of a frame can be used."""
+    config = context.config.tracking
+    # The search windows of an RGB-D camera are wide, so that even a wrong pose has some inliers.
+    share = config.depth_min_inlier_ratio if context.camera.depth else 0.0
+    if n_inliers < config.min_inliers_lost or n_inliers < share * n_matches:
+        return TrackingState.LOST
+    return TrackingState.WEAK if n_inliers < config.min_inliers else TrackingState.OK
 
 
 def trusted_landmarks(
@@ -394,7 +365,7 @@ def trusted_landmarks(
 
 
 def uncertainty_of(
-    frame: Frame, offset_sigma: float, context: Context
+    track: Track, offset_sigma: float, context: Context
 ) -> tuple[Matrix, Matrix | None]:
     """Estimate the uncertainty of the pose and of the motion of a tracked frame.
 
@@ -407,43 +378,42 @@ def uncertainty_of(
         the motion if the disparity offset is wrong by ``offset_sigma`` (``offset_effect``). It is
         None if ``offset_sigma`` is 0.
     """
-    matched = np.flatnonzero(np.isfinite(frame.xyz[:, 0]))
-    observed = _observed_points(frame, matched, context)
-    covariance, effect = pose_covariance(frame.T_cw, *observed), None
+    matched = np.flatnonzero(np.isfinite(track.xyz[:, 0]))
+    observed = _observed_points(track, matched, context)
+    covariance, effect = pose_covariance(track.T_cw, *observed), None
     if offset_sigma > 0.0:
-        effect = offset_sigma * offset_effect(frame.T_cw, *observed[:4])
+        effect = offset_sigma * offset_effect(track.T_cw, *observed[:4])
     return covariance, effect
 
 
 def _observed_points(
-    frame: Frame, matched: NDArray[np.integer], context: Context
+    track: Track, matched: NDArray[np.integer], context: Context
 ) -> tuple[NDArray[np.float64], ...]:
     """Return the arguments of ``optimise_pose`` that follow ``T_cw``, for the points that the
     features ``matched`` track. Aligned matches have their aligned positions."""
-    uvr, weight = observations(frame, matched, context)
+    uvr, weight = observations(track.features, matched, context)
     certainty = np.ones(len(matched))
-    if frame.shift is not None:
-        shift = frame.shift[matched]
+    if track.shift is not None:
+        shift = track.shift[matched]
         aligned = np.isfinite(shift[:, 0])
         uvr[aligned] += shift[aligned][:, [0, 1, 0]]
         certainty[aligned] = context.config.alignment.certainty
     disparity_weight = DISPARITY_WEIGHT / np.sqrt(certainty)
     intrinsics = context.camera.intrinsics
-    return frame.xyz[matched], uvr, weight * certainty, intrinsics, disparity_weight
+    return track.xyz[matched], uvr, weight * certainty, intrinsics, disparity_weight
 
 
 def observations(
-    frame: Frame, feature: NDArray[np.integer], context: Context
+    features: Features, chosen: NDArray[np.integer], context: Context
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the observed image positions of N features of a frame, and their weights.
 
     Args:
-        feature: ``(N,)`` indices of the features.
+        chosen: ``(N,)`` indices of the features.
 
     Returns:
         ``(N, 3)`` float64 u, v and u_right in pixels, and ``(N,)`` float64 inverse variances of u
         and v.
     """
-    features = frame.features
-    uvr = stack_uvr(features.xy[feature], features.u_right[feature])
-    return uvr, context.scales[features.octave[feature]] ** -2.0
+    uvr = stack_uvr(features.xy[chosen], features.u_right[chosen])
+    return uvr, context.scales[features.octave[chosen]] ** -2.0

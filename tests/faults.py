@@ -85,7 +85,7 @@ LATER = ("report.json", "report.md", "report.html", "figures")  # written after 
 POINTS = (
     Point("a frame's track", "vslam.frontend.tracker.Tracker.track", 200, EARLY),
     Point("keyframe policy", "vslam.modes.MapBuilding.update_map", 200, EARLY),
-    Point("merging a keyframe", "vslam.mapping.Mapper._renew_view", 8, EARLY),
+    Point("publishing a keyframe", "vslam.mapping.Mapper._renew_view", 8, EARLY),
     Point("place detector, locate", "ring.Oracle.locate", 2, EARLY),
     Point("place detector, add", "ring.Oracle.add", 12, ON),
     Point("place detector, query", "ring.Oracle.query", 12, ON),

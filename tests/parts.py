@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vslam.camera import Camera
-from vslam.features import Extracted, Features
-from vslam.frontend.frame import Frame
+from vslam.features import Extracted, Features, TrackingState
+from vslam.frontend.track import By, Track
 from vslam.geometry import se3_exp, transform
 from vslam.map_view import LocalMap, MapView
 from vslam.workers import Job, Urgency, Workers
@@ -31,13 +31,15 @@ class InstantWorkers(Workers):
 
 
 def frame_of(
-    features: Features,
+    features: Features | Extracted,
     index: int = 0,
     timestamp: float = 0.0,
-    image: np.ndarray | None = None,
-    camera: Camera = CAMERA,
-) -> Frame:
-    return Frame.of(Extracted(features), camera, index, timestamp, image)
+    T_cw: np.ndarray | None = None,
+) -> Track:
+    """Return a frame with features that are not matched yet."""
+    extracted = features if isinstance(features, Extracted) else Extracted(features)
+    lost = Track(index, timestamp, np.eye(4) if T_cw is None else T_cw)
+    return lost.with_features(extracted)
 
 
 def ahead(metres: float, turn: float = 0.0) -> np.ndarray:
@@ -89,17 +91,22 @@ class Points:
             u_right=uvr[:, 2],
         )
 
-    def frame(self, index: int, timestamp: float, T_cw: np.ndarray, among: slice = ALL) -> Frame:
+    def frame(self, index: int, timestamp: float, T_cw: np.ndarray, among: slice = ALL) -> Track:
         return frame_of(self.see(T_cw, among), index, timestamp)
 
     def tracked_frame(
         self, index: int, timestamp: float, T_cw: np.ndarray, among: slice = ALL
-    ) -> Frame:
-        frame = self.frame(index, timestamp, T_cw, among)
-        frame.T_cw = T_cw
-        frame.landmark[:] = np.arange(len(self.xyz), dtype=np.int32)[among]
-        frame.xyz[:] = self.xyz[among]
-        return frame
+    ) -> Track:
+        ids = np.arange(len(self.xyz), dtype=np.int32)[among]
+        return replace(
+            self.frame(index, timestamp, T_cw, among),
+            T_cw=T_cw,
+            landmark=ids,
+            xyz=self.xyz[among],
+            state=TrackingState.OK,
+            by=By.FEATURES,
+            n_inliers=len(ids),
+        )
 
     def landmarks(self, among: slice = ALL) -> LocalMap:
         xyz = self.xyz[among]

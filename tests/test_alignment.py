@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from parts import frame_of
 
 from vslam.camera import Camera
 from vslam.config import Config
@@ -16,11 +17,9 @@ from vslam.features import (
     Features,
     KeyframePatches,
 )
-from vslam.frontend.alignment import align, align_frame, warps
-from vslam.frontend.frame import Frame
+from vslam.frontend.alignment import align, align_matches, warps
 from vslam.frontend.orb import build_pyramid, extract
 from vslam.frontend.patches import RecentPatches, patches_around
-from vslam.frontend.rig import RigCalibration
 from vslam.frontend.tracking import refine
 from vslam.geometry import inverse, se3_exp, transform
 from vslam.map import Map
@@ -268,9 +267,8 @@ def test_matches_are_aligned_however_the_camera_has_moved(motion):
         uvr = CAMERA.project(transform(T, points)).astype(np.float32)
         xy = np.rint(uvr[:, :2] + off).astype(np.float32)
         features = replace(features_at(0, 0, 0, n), xy=xy)
-        frame = Frame.of(Extracted(features, build_pyramid(image(T), Config().orb)), CAMERA)
-        frame.T_cw, frame.landmark, frame.xyz = T, np.arange(n, dtype=np.int32), points
-        return frame, uvr[:, :2]
+        frame = frame_of(Extracted(features, build_pyramid(image(T), Config().orb)), T_cw=T)
+        return frame.matching(np.arange(n), np.arange(n, dtype=np.int32), points), uvr[:, :2]
 
     first, seen_at = frame_at(np.eye(4), 0.0)
     map_ = Map(CONTEXT.scales)
@@ -278,13 +276,13 @@ def test_matches_are_aligned_however_the_camera_has_moved(motion):
     ids = map_.add_landmarks(points, np.zeros((n, 4), np.uint64), 0)
     link_many(map_.arrays, np.arange(n), ids)
     recent = RecentPatches(2)
-    pixels = patches_around(first.pyramid, first.features.xy, first.features.octave)
+    pixels = patches_around(first.extracted.pyramid, first.features.xy, first.features.octave)
     recent.add(KeyframePatches(0, pixels, seen_at - first.features.xy))
 
     frame, truth = frame_at(T_cw, rng.uniform(-0.5, 0.5, (n, 2)))
     inside = ((truth > 20) & (truth < [620, 460])).all(axis=1)
-    frame.landmark[~inside] = -1
-    shift = align_frame(
+    frame = frame.without(~inside)
+    shift = align_matches(
         frame, recent.of(map_, ids), CONTEXT.scales, CAMERA.intrinsics, Config().alignment
     )
     error = np.linalg.norm(frame.features.xy + shift - truth, axis=1)[inside]
@@ -312,19 +310,18 @@ def test_what_lies_behind_a_camera_or_is_seen_from_behind_has_no_warp():
 def test_matches_without_a_patch_are_not_aligned():
     map_, recent = one_landmark()
     known, _, _ = patches_of(map_, [0], [recent])
-    frame = Frame.of(extracted_at(100, 50, 0, 1), CAMERA)
-    frame.landmark[:], frame.xyz[:] = 7, 1.0
+    frame = frame_of(extracted_at(100, 50, 0, 1)).matching(slice(None), 7, 1.0)
     arguments = CONTEXT.scales, CAMERA.intrinsics, Config().alignment
-    assert np.isnan(align_frame(frame, known, *arguments)).all()
-    assert align_frame(frame, NO_PATCHES, *arguments) is None
-    frame.pyramid = None
-    assert align_frame(frame, known, *arguments) is None
+    assert np.isnan(align_matches(frame, known, *arguments)).all()
+    assert align_matches(frame, NO_PATCHES, *arguments) is None
+    frame = replace(frame, extracted=replace(frame.extracted, pyramid=None))
+    assert align_matches(frame, known, *arguments) is None
 
 
 def test_an_aligned_frame_observes_where_matches_were_aligned_to():
-    frame = Frame.of(extracted_at(100, 50, 0, 3), CAMERA)
-    frame.landmark[:] = 0, 1, -1
-    frame.shift = np.array([[0.5, -0.25], [np.nan, np.nan], [1.0, 1.0]], np.float32)
+    shift = np.array([[0.5, -0.25], [np.nan, np.nan], [1.0, 1.0]], np.float32)
+    frame = frame_of(extracted_at(100, 50, 0, 3))
+    frame = replace(frame, landmark=np.array([0, 1, -1], np.int32), shift=shift)
     assert frame.aligned.tolist() == [True, False, False]
     observed = frame.refined_features()
     assert observed.xy.tolist() == [[100.5, 49.75], [100.0, 50.0], [100.0, 50.0]]
@@ -339,15 +336,15 @@ def test_a_pose_follows_aligned_matches():
     """
     rng = np.random.default_rng(0)
     n = 100
-    frame = Frame.of(extracted_at(100, 50, 0, n), CAMERA)
-    frame.xyz = np.column_stack([rng.uniform(-8, 8, (n, 2)), rng.uniform(8, 30, n)])
-    uvr = CAMERA.project(frame.xyz).astype(np.float32)
-    frame.landmark = np.arange(n, dtype=np.int32)
-    frame.features = replace(frame.features, xy=uvr[:, :2], u_right=uvr[:, 2])
+    xyz = np.column_stack([rng.uniform(-8, 8, (n, 2)), rng.uniform(8, 30, n)])
+    uvr = CAMERA.project(xyz).astype(np.float32)
+    features = replace(features_at(100, 50, 0, n), xy=uvr[:, :2], u_right=uvr[:, 2])
+    frame = frame_of(features).matching(np.arange(n), np.arange(n, dtype=np.int32), xyz)
     shift = np.full((n, 2), np.nan, np.float32)
     shift[::2] = 0.5, 0.0
-    assert refine(frame, np.eye(4), NO_LANDMARKS, CONTEXT, shift) == n
-    moved = CAMERA.project(transform(frame.T_cw, frame.xyz))[:, 0] - uvr[:, 0]
+    found = refine(frame, np.eye(4), NO_LANDMARKS, CONTEXT, shift)
+    assert found.n_inliers == n
+    moved = CAMERA.project(transform(found.T_cw, xyz))[:, 0] - uvr[:, 0]
     certainty = Config().alignment.certainty
     assert moved.mean() == pytest.approx(0.5 * certainty / (certainty + 1), abs=0.02)
 
@@ -356,7 +353,7 @@ def test_the_map_knows_how_sure_each_observation_is(two_keyframes):
     frame, mapper = two_keyframes
     known = mapper.view.patches
     pixels, shift = known.pixels[known.where], known.shift[known.where]
-    map_ = mapper.complete()
+    map_ = mapper.wait()
     sure = Config().alignment.certainty
     # One feature is tracked and aligned, one is only tracked, and one is new.
     assert map_.arrays.certainty[map_.rows(1)].tolist() == [sure, 1, sure]
@@ -375,16 +372,11 @@ def two_keyframes():
 
     config = Config()
     closing = LoopClosing(NoDetector(), verifier_for(config, CAMERA), CAMERA, config, threads=1)
-    rig = RigCalibration(CAMERA, config.stereo, CONTEXT.scales)
-    mapper = Mapper(CONTEXT, closing, rig, Workers(1))
-    frames = []
-    for index in range(2):
-        frame = Frame.of(extracted_at(100, 50, 0, 3), CAMERA, index, 0.1 * index)
-        frames.append(frame)
-        mapper.append_pose(frame, tracked=True)
-    mapper.insert(frames[0])
-    frames[1].landmark = frames[0].landmark.copy()
-    frames[1].landmark[2] = -1
-    frames[1].shift = np.array([[0.5, -0.25], [np.nan] * 2, [np.nan] * 2], np.float32)
-    mapper.insert(frames[1])
-    return frames[1], mapper
+    mapper = Mapper(CONTEXT, closing, Workers(1))
+    first, second = (frame_of(extracted_at(100, 50, 0, 3), k, 0.1 * k) for k in range(2))
+    mapper.record(first)
+    first = mapper.insert(first, None)
+    mapper.record(second)
+    shift = np.array([[0.5, -0.25], [np.nan] * 2, [np.nan] * 2], np.float32)
+    seen = second.matching(np.arange(2), first.landmark[:2], first.xyz[:2])
+    return mapper.insert(replace(seen, shift=shift), None), mapper

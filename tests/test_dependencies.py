@@ -43,7 +43,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.map_view", "vslam.shared_map"),
     ("vslam.frontend", "vslam.backend", "vslam.loopclosure", "vslam.datasets", "vslam.maps"),
     ("vslam.hypotheses",),
-    ("vslam.starter", "vslam.closing"),
+    ("vslam.starter", "vslam.closing", "vslam.motion"),
     ("vslam.map_frames", "vslam.gaps"),
     ("vslam.mapping", "vslam.merging"),
     ("vslam.modes",),

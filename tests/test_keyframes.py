@@ -10,7 +10,6 @@ from parts import CAMERA, Points
 
 from vslam.config import Config, KeyframeConfig
 from vslam.context import Context
-from vslam.frontend.frame import Frame
 from vslam.frontend.keyframes import (
     KeyframeEvidence,
     KeyframePolicy,
@@ -18,6 +17,7 @@ from vslam.frontend.keyframes import (
     needs_keyframe,
     needs_monocular_keyframe,
 )
+from vslam.frontend.track import Track
 
 CONFIG = KeyframeConfig(
     max_interval_s=1.0,
@@ -166,16 +166,15 @@ def policy(camera=CAMERA) -> KeyframePolicy:
     return KeyframePolicy(Context.create(camera, Config(keyframes=CONFIG)))
 
 
-def frame(*, close: int, far: int = 0) -> Frame:
+def frame(*, close: int, far: int = 0) -> Track:
     tracked = POINTS.tracked_frame(3, 0.3, np.eye(4))
     is_close = POINTS.xyz[:, 2] < 20.0
     for among, n in ((is_close, close), (~is_close, far)):
-        lost = np.flatnonzero(among)[n:]
-        tracked.landmark[lost], tracked.xyz[lost] = -1, np.nan
+        tracked = tracked.without(np.flatnonzero(among)[n:])
     return tracked
 
 
-def observe(of: KeyframePolicy, seen: Frame, **changes) -> KeyframeEvidence:
+def observe(of: KeyframePolicy, seen: Track, **changes) -> KeyframeEvidence:
     """Return the decision of a policy about a frame 0.3 s after a keyframe. Mapping is idle."""
     known = {"seconds_since_keyframe": 0.3, "mapping_idle": True}
     return of.observe(seen, POINTS.view(n_reference=200), **known | changes)
@@ -252,8 +251,7 @@ def test_close_points_are_lost_from_the_first_frame_after_a_keyframe_on():
     one.reference_renewed()
     seen = frame(close=20)
     assert observe(one, seen).close_ratio == 1.0
-    seen = frame(close=5)
-    seen.index += 2
+    seen = replace(frame(close=5), index=5)
     assert observe(one, seen).close_ratio == pytest.approx(0.5)
     assert observe(one, frame(close=0)).close_ratio == 1.0  # a value of 1 disables the share
 

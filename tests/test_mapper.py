@@ -1,4 +1,4 @@
-"""The mapper in isolation: when it merges, what follows the map, and its state after a failure."""
+"""The mapper in isolation: when it publishes, what moves with the map, and failures."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from vslam.camera import Camera
 from vslam.closing import LoopSearch
 from vslam.config import Config
 from vslam.context import Context
-from vslam.features import PATCH_PIXELS, Extracted, Features, KeyframePatches
-from vslam.frontend.frame import Frame
+from vslam.features import PATCH_PIXELS, Extracted, Features, KeyframePatches, TrackingState
 from vslam.frontend.orb import build_pyramid
 from vslam.frontend.patches import patches_around
-from vslam.frontend.rig import RigCalibration
+from vslam.frontend.rig import with_offset
+from vslam.frontend.track import Track
 from vslam.frontend.tracking import track_local_map
 from vslam.geometry import inverse, se3_exp
 from vslam.loopclosure.detector import NoDetector
@@ -116,37 +116,30 @@ class Drive:
         config = Config.model_validate({"keyframes": keyframes, "tracking": tracking or {}})
         self.context = Context.create(camera, config)
         self.closing = closing or Closing()
-        self.rig = RigCalibration(camera, config.stereo, self.context.scales)
-        self.mapper = Mapper(self.context, self.closing, self.rig, workers or Workers(1))
-        self.last: Frame | None = None
+        self.mapper = Mapper(self.context, self.closing, workers or Workers(1))
+        self.last: Track | None = None
         self._see, self._at = see, poses
 
-    def next_frame(self) -> Frame:
+    def next_frame(self) -> Track:
         """Return the next frame at its true pose, tracked in the mapper's view of the map."""
-        k, mapper = len(self.mapper.frames), self.mapper
-        frame = frame_of(self._see(k), k, 0.1 * k, camera=self.context.camera)
-        frame.T_cw = self._at(k)
-        self.rig.prepare(frame, None)
-        if mapper.n_keyframes:
-            _, _, visible = track_local_map(
-                frame, mapper.view.local_landmarks, self.context, window=8.0
-            )
-            mapper.count(visible, frame.landmark[frame.landmark >= 0])
+        k, view = len(self.mapper.frames), self.mapper.view
+        extracted = with_offset(Extracted(self._see(k)), view.disparity_offset)
+        frame = replace(frame_of(extracted, k, 0.1 * k, self._at(k)), state=TrackingState.OK)
+        if view.n_keyframes:
+            frame = track_local_map(frame, view.local_landmarks, self.context, window=8.0)
+            self.mapper.count(frame)
         return frame
 
-    def step(self, *, keyframe: bool = False) -> Frame:
-        """Track the next frame and place it. If requested, make it a keyframe."""
-        self.mapper.merge_if_due(len(self.mapper.frames))
+    def step(self, *, keyframe: bool = False) -> Track:
+        """Track the next frame and record it. If requested, make it a keyframe."""
+        self.mapper.publish(frame=len(self.mapper.frames))
         frame = self.next_frame()
-        self.mapper.hold(self.last, frame)
-        self.mapper.append_pose(frame, tracked=True)
-        if keyframe:
-            self.mapper.insert(frame)
-        self.last = frame
-        return frame
+        self.mapper.record(frame)
+        self.last = self.mapper.insert(frame, None) if keyframe else frame
+        return self.last
 
     def steps(self, keyframes: Iterable[int], n: int) -> None:
-        """Track and place n frames. Some of them become keyframes."""
+        """Track and record n frames. Some of them become keyframes."""
         for k in range(n):
             self.step(keyframe=k in keyframes)
 
@@ -167,27 +160,27 @@ def bytes_of_map(map_: Map) -> bytes:
 
 def test_the_first_keyframe_is_mapped_at_once():
     drive = Drive()
-    assert (drive.mapper.n_keyframes, drive.mapper.is_merged) == (0, True)
+    assert (drive.mapper.n_keyframes, drive.mapper.is_published) == (0, True)
     drive.step(keyframe=True)
     assert drive.mapper.n_keyframes == 1
-    assert drive.mapper.is_merged
+    assert drive.mapper.is_published
     assert not drive.mapper.is_mapping
     assert len(drive.mapper.view.local_landmarks.ids) == drive.mapper.map.n_landmarks > 50
 
 
 @late_and_early
 @pytest.mark.parametrize("after", [1, 2, 4])
-def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(workers, after):
+def test_a_keyframe_is_published_at_the_frame_that_is_due_and_no_other(workers, after):
     drive = Drive(workers(), merge_after_frames=after)
     drive.steps([0, 3], 4)
     mapper, shown = drive.mapper, drive.mapper.view
     assert (mapper.last_frame, shown.reference, shown.n_keyframes) == (3, 1, 2)
     for _ in range(after - 1):
         drive.step()
-        assert (mapper.is_merged, mapper.is_mapping) == (False, True)
+        assert (mapper.is_published, mapper.is_mapping) == (False, True)
         assert mapper.view is shown
     drive.step()
-    assert (mapper.is_merged, mapper.is_mapping) == (True, False)
+    assert (mapper.is_published, mapper.is_mapping) == (True, False)
     assert mapper.view is not shown
     assert len(mapper.view.local_landmarks.ids) > len(
         shown.local_landmarks.ids
@@ -198,30 +191,30 @@ def test_a_keyframe_is_merged_at_the_frame_that_is_due_and_no_other(workers, aft
 
 
 @late_and_early
-def test_whoever_needs_the_map_merges(workers):
+def test_whoever_changes_the_map_publishes_first(workers):
     for use in (
-        lambda drive: drive.mapper.merge(),
+        lambda drive: drive.mapper.publish(),
         lambda drive: drive.mapper.finish(),
-        lambda drive: drive.mapper.find_old_place(drive.last),
-        lambda drive: drive.mapper.refer_to_nearest(drive.last),
+        lambda drive: drive.mapper.settle(drive.last),
         lambda drive: drive.mapper.map_far_points(drive.last),
+        lambda drive: drive.mapper.insert(drive.last, None),
     ):
         drive = Drive(workers(), merge_after_frames=9)
         drive.steps([0, 3], 4)
         shown = drive.mapper.view
         use(drive)
-        assert drive.mapper.is_merged
+        assert drive.mapper.is_published == (drive.mapper.n_keyframes == 2)
         assert len(drive.mapper.view.local_landmarks.ids) > len(shown.local_landmarks.ids)
 
 
-def test_a_keyframe_merges_the_one_before():
+def test_a_keyframe_publishes_the_one_before():
     processed = []
     drive = Drive(closing=Closing(lambda map_, keyframe: processed.append(keyframe)))
     drive.steps([0, 3, 4], 4)
     assert processed == [0]
     drive.step(keyframe=True)
     assert processed == [0, 1]
-    assert not drive.mapper.is_merged  # the new keyframe is not merged
+    assert not drive.mapper.is_published  # the new keyframe is not published
 
 
 def trace_on_the_ring(workers, look: Callable[[Mapper], object] = lambda mapper: None) -> list:
@@ -240,12 +233,14 @@ def trace_on_the_ring(workers, look: Callable[[Mapper], object] = lambda mapper:
         frame = drive.step(keyframe=k in (0, 2, 5, 6, 9, 13))
         mapper = drive.mapper
         assert np.count_nonzero(frame.landmark >= 0) > 200
-        counts = (mapper.is_merged, mapper.reference, mapper.n_keyframes)
+        counts = (mapper.is_published, mapper.reference, mapper.n_keyframes)
         poses = [frame.T_cw, *(mapper.frames.pose(i) for i in (-1, mapper.last_frame))]
         seen.append((counts, bytes_of_view(mapper.view), np.array(poses).tobytes()))
         look(mapper)
     drive.mapper.finish()
-    assert len({view for _, view, _ in seen}) == 10  # each keyframe and each merge changes the view
+    assert (
+        len({view for _, view, _ in seen}) == 10
+    )  # each keyframe and each publication changes the view
     trajectory = drive.mapper.trajectory().T_wc.tobytes()
     return [*seen, bytes_of_map(drive.mapper.map), trajectory]
 
@@ -255,7 +250,7 @@ def test_nothing_tells_whether_a_keyframe_is_mapped_early_or_late():
 
 
 def test_completing_a_keyframe_early_changes_no_result():
-    assert trace_on_the_ring(Workers(1), Mapper.complete) == trace_on_the_ring(Workers(1))
+    assert trace_on_the_ring(Workers(1), Mapper.wait) == trace_on_the_ring(Workers(1))
 
 
 @late_and_early
@@ -263,16 +258,12 @@ def test_completing_shows_tracking_nothing(workers):
     drive = Drive(workers(), merge_after_frames=9)
     drive.steps([0, 3], 5)
     mapper, shown = drive.mapper, drive.mapper.view
-    held = [drive.last, drive.next_frame()]
-    mapper.hold(*held)
-    before = [(frame.T_cw.tobytes(), frame.landmark.tobytes()) for frame in held]
-    map_ = mapper.complete()
+    map_ = mapper.wait()
     assert len(np.unique(map_.arrays.first_keyframe[: map_.n_landmarks])) == 2
-    assert (mapper.is_merged, mapper.is_mapping) == (False, False)
+    assert (mapper.is_published, mapper.is_mapping) == (False, False)
     assert mapper.view is shown
-    assert [(frame.T_cw.tobytes(), frame.landmark.tobytes()) for frame in held] == before
-    assert mapper.complete() is map_  # the second call returns the same map
-    mapper.merge()
+    assert mapper.wait() is map_  # the second call returns the same map
+    mapper.publish()
     assert mapper.view is not shown
 
 
@@ -293,8 +284,8 @@ def test_a_trajectory_is_not_to_be_had_even_if_all_frames_follow_the_reference_k
     """This is the state at the beginning of a new drive in an existing map."""
     drive = Drive()
     drive.steps([0, 3], 6)
-    map_ = drive.mapper.complete()
-    drive.mapper = Mapper(drive.context, drive.closing, drive.rig, Workers(1), map_)
+    map_ = drive.mapper.wait()
+    drive.mapper = Mapper(drive.context, drive.closing, Workers(1), map_)
     drive.step(keyframe=True)
     with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
         drive.mapper.trajectory()
@@ -306,18 +297,18 @@ def test_the_map_counts_what_frames_saw_when_it_is_free(workers):
     drive.steps([0, 3], 4)
     visible, found = np.array([3, 4, 5], np.int32), np.array([4], np.int32)
     for _ in range(2):
-        drive.mapper.count(visible, found)
+        drive.mapper.count(replace(drive.last, visible=visible, landmark=found))
     counters = [], []
     for one in (drive, Drive(workers(), merge_after_frames=9)):
         if one is not drive:
             one.steps([0, 3], 4)
-        arrays = one.mapper.complete().arrays
+        arrays = one.mapper.wait().arrays
         counters[0].append(arrays.visible[3:6].copy())
         counters[1].append(arrays.found[3:6].copy())
     np.testing.assert_array_equal(counters[0][0] - counters[0][1], [2, 2, 2])
     np.testing.assert_array_equal(counters[1][0] - counters[1][1], [0, 2, 0])
     before = arrays.visible[3]
-    drive.mapper.complete()
+    drive.mapper.wait()
     assert arrays.visible[3] == before  # each frame counts once
 
 
@@ -327,8 +318,8 @@ MOVES = [se3_exp(np.array(twist)) for twist in ([0.3, 0, 0, 0, 0.02, 0], [0, 0, 
 
 
 @late_and_early
-def test_held_frames_follow_a_merge(workers):
-    """A frame that is not placed follows the reference keyframe."""
+def test_frames_move_with_the_map(workers):
+    """A frame that is not recorded follows the reference keyframe."""
 
     def move(map_: Map, keyframe: int) -> None:
         for k in range(keyframe + 1 if keyframe else 0):
@@ -338,22 +329,21 @@ def test_held_frames_follow_a_merge(workers):
     drive.step(keyframe=True)
     placed = drive.step()
     T_0 = drive.mapper.view.T_reference
-    free = drive.step()
     drive.step(keyframe=True)
     T_1 = drive.mapper.view.T_reference
     unplaced = drive.next_frame()
-    before = [frame.T_cw.copy() for frame in (placed, unplaced, free)]
-    drive.mapper.hold(placed, unplaced)
-    after = drive.mapper.merge().arrays.T_cw
+    before = [frame.T_cw.copy() for frame in (placed, unplaced)]
+    moved = drive.mapper.publish(placed, unplaced)
+    after = drive.mapper.map.arrays.T_cw
     assert np.linalg.norm((after[0] @ inverse(T_0))[:3, 3]) > 0.1
-    np.testing.assert_allclose(placed.T_cw, before[0] @ inverse(T_0) @ after[0], atol=1e-12)
-    np.testing.assert_allclose(unplaced.T_cw, before[1] @ inverse(T_1) @ after[1], atol=1e-12)
-    np.testing.assert_array_equal(free.T_cw, before[2])  # not held
-    np.testing.assert_array_equal(placed.T_cw, drive.mapper.frames.pose(placed.index))
+    np.testing.assert_allclose(moved[0].T_cw, before[0] @ inverse(T_0) @ after[0], atol=1e-12)
+    np.testing.assert_allclose(moved[1].T_cw, before[1] @ inverse(T_1) @ after[1], atol=1e-12)
+    np.testing.assert_array_equal(placed.T_cw, before[0])  # what was passed is not changed
+    np.testing.assert_array_equal(moved[0].T_cw, drive.mapper.frames.pose(placed.index))
 
 
 @late_and_early
-def test_held_frames_track_what_became_of_their_landmarks(workers):
+def test_moved_frames_track_what_became_of_their_landmarks(workers):
     gone = 7
 
     def change(map_: Map, keyframe: int) -> None:
@@ -365,18 +355,18 @@ def test_held_frames_track_what_became_of_their_landmarks(workers):
     drive = Drive(workers(), Closing(change), merge_after_frames=9)
     drive.steps([0, 3], 4)
     held = [drive.last, drive.next_frame()]
-    drive.mapper.hold(*held)
-    tracked = [frame.landmark.copy() for frame in held]
-    columns = [frame.features.u_right.copy() for frame in held]
-    arrays = drive.mapper.merge().arrays
-    for frame, landmark, u_right in zip(held, tracked, columns, strict=True):
-        assert gone in landmark
-        np.testing.assert_array_equal(frame.landmark, np.where(landmark == gone, -1, landmark))
+    moved = drive.mapper.publish(*held)
+    arrays = drive.mapper.map.arrays
+    for frame, before in zip(moved, held, strict=True):
+        assert gone in before.landmark
+        expected = np.where(before.landmark == gone, -1, before.landmark)
+        np.testing.assert_array_equal(frame.landmark, expected)
         known = frame.landmark >= 0
         np.testing.assert_array_equal(frame.xyz[known], arrays.xyz[frame.landmark[known]])
         assert np.isnan(frame.xyz[~known]).all()
+        u_right = before.features.u_right
         np.testing.assert_allclose(frame.features.u_right, u_right - 0.125, atol=1e-4)
-    assert drive.rig.disparity_offset == 0.125
+    assert drive.mapper.view.disparity_offset == 0.125
 
 
 def see_without_depth(k: int) -> Features:
@@ -396,13 +386,12 @@ def monocular_drive(workers, closing: Closing) -> Drive:
 def begin_with_two_views(drive: Drive) -> None:
     frames = []
     for _ in range(4):
-        frames.append(drive.next_frame())
-        frames[-1].T_cw = np.eye(4)
-        drive.mapper.append_pose(frames[-1], tracked=False)
+        lost = replace(drive.next_frame(), T_cw=np.eye(4), state=TrackingState.LOST)
+        frames.append(lost)
+        drive.mapper.record(lost)
     every = np.arange(len(POINTS.xyz))
-    start = TwoViewStart(frames[0], frames[3], at(3), (every, every), POINTS.xyz)
-    drive.mapper.begin(start, lambda: None)
-    drive.last = frames[3]
+    views, images = (frames[0], frames[3]), (None, None)
+    drive.last = drive.mapper.begin(TwoViewStart(*views, images, at(3), (every, every), POINTS.xyz))
 
 
 def test_a_monocular_map_begins_with_two_keyframes():
@@ -410,7 +399,7 @@ def test_a_monocular_map_begins_with_two_keyframes():
     drive = monocular_drive(None, Closing(lambda map_, k: processed.append(k)))
     map_, second = drive.mapper.map, drive.last
     assert processed == [0, 1]
-    assert (drive.mapper.is_merged, drive.mapper.last_frame) == (True, 3)
+    assert (drive.mapper.is_published, drive.mapper.last_frame) == (True, 3)
     assert drive.mapper.last_timestamp == second.timestamp
     assert (map_.frames.tolist(), map_.parents.tolist()) == ([0, 3], [-1, 0])
     assert map_.n_landmarks == 240
@@ -436,20 +425,15 @@ def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_
     placed = drive.step()
     drive.step(keyframe=True)
     unplaced = drive.next_frame()
-    held = [placed, unplaced]
-    for frame in held:
-        frame.twist = np.arange(1.0, 7.0)
-    poses = [frame.T_cw.copy() for frame in held]
-    drive.mapper.hold(*held)
-    drive.mapper.merge()
-    for frame, before in zip(held, poses, strict=True):
+    held = [replace(frame, twist=np.arange(1.0, 7.0)) for frame in (placed, unplaced)]
+    moved = drive.mapper.publish(*held)
+    for frame, before in zip(moved, held, strict=True):
         np.testing.assert_allclose(frame.twist, [2, 4, 6, 4, 5, 6])
         # All positions are measured from the first keyframe, which is the origin.
-        np.testing.assert_allclose(frame.T_cw[:3, 3], 2.0 * before[:3, 3], atol=2e-3)
-        np.testing.assert_allclose(frame.T_cw[:3, :3], before[:3, :3], atol=1e-4)
-    drive.mapper.hold(*held)
-    drive.mapper.finish()  # finish has changed nothing
-    np.testing.assert_allclose(held[0].twist, [2, 4, 6, 4, 5, 6])
+        np.testing.assert_allclose(frame.T_cw[:3, 3], 2.0 * before.T_cw[:3, 3], atol=2e-3)
+        np.testing.assert_allclose(frame.T_cw[:3, :3], before.T_cw[:3, :3], atol=1e-4)
+    moved = drive.mapper.finish(*moved)  # finish has changed nothing
+    np.testing.assert_allclose(moved[0].twist, [2, 4, 6, 4, 5, 6])
 
 
 @pytest.mark.parametrize("adjusting", [False, True])
@@ -466,20 +450,20 @@ def test_where_culled_landmarks_are_dropped_frames_track_the_same_points(adjusti
 
     drive = Drive(None, Closing(kill), merge_after_frames=9)
     drive.steps([0, 3], 4)
-    drive.mapper.merge()
+    drive.mapper.publish()
     drive.closing.is_adjusting = adjusting
     monkeypatch.setattr(Map, "many_culled_landmarks", True)
-    held, new = drive.step(), drive.next_frame()
-    drive.mapper.append_pose(new, tracked=True)
-    drive.mapper.hold(held, new)
-    numbers, xyz = [frame.landmark.copy() for frame in (held, new)], held.xyz.copy()
-    drive.mapper.insert(new)
-    map_ = drive.mapper.complete()
+    drive.step()
+    new = drive.next_frame()
+    drive.mapper.record(new)
+    keyframe = drive.mapper.insert(new, None)
+    map_ = drive.mapper.wait()
     assert map_.arrays.landmark_alive[: map_.n_landmarks].all() != adjusting
-    assert np.array_equal(held.landmark, numbers[0]) == adjusting
-    known = held.landmark >= 0
-    assert np.count_nonzero(known) == np.count_nonzero(numbers[0] >= 0)
-    np.testing.assert_allclose(map_.arrays.xyz[held.landmark[known]], xyz[known], atol=0.05)
+    known = new.landmark >= 0
+    assert np.array_equal(keyframe.landmark[known], new.landmark[known]) == adjusting
+    assert (keyframe.landmark[known] >= 0).all()
+    now = map_.arrays.xyz[keyframe.landmark[known]]
+    np.testing.assert_allclose(now, new.xyz[known], atol=0.05)
 
 
 # -- the reference keyframe -----------------------------------------------------------------------
@@ -489,8 +473,8 @@ def test_a_frame_may_be_placed_by_the_keyframe_near_which_it_was_found():
     drive = Drive()
     drive.steps([0, 3], 6)
     assert drive.mapper.reference == 1
-    frame = drive.next_frame()
-    drive.mapper.append_pose(frame, tracked=True, near=0)
+    frame = replace(drive.next_frame(), near=0)
+    drive.mapper.record(frame)
     assert drive.mapper.reference == 0
     assert drive.mapper.frames.table().reference[-1] == 0
     np.testing.assert_allclose(drive.mapper.frames.pose(-1), frame.T_cw, atol=1e-12)
@@ -503,13 +487,11 @@ def test_the_reference_can_be_the_keyframe_that_shares_the_most_with_a_frame():
     mapper.refer_to(0)
     mapper.refer_to_nearest(frame)
     assert mapper.reference == 1
-    other = np.isin(frame.landmark, mapper.map.landmarks_of(1))
-    frame.landmark[other], frame.xyz[other] = -1, np.nan
-    mapper.refer_to_nearest(frame)
+    others = frame.without(np.isin(frame.landmark, mapper.map.landmarks_of(1)))
+    mapper.refer_to_nearest(others)
     assert mapper.reference == 1  # the frame shares no landmark with any keyframe
-    frame.landmark[:] = -1
-    frame.landmark[:20] = np.setdiff1d(mapper.map.landmarks_of(0), mapper.map.landmarks_of(1))[:20]
-    mapper.refer_to_nearest(frame)
+    old = np.setdiff1d(mapper.map.landmarks_of(0), mapper.map.landmarks_of(1))[:20]
+    mapper.refer_to_nearest(replace(frame, landmark=old))
     assert mapper.reference == 0
 
 
@@ -535,7 +517,7 @@ def test_what_is_seen_at_a_known_place_is_kept_a_few_times():
     mapper.use_existing_keyframe(mapper.find_old_place(frame), frame)
     revisits = mapper.map.revisits
     assert revisits.keyframe.tolist() == [0]
-    np.testing.assert_array_equal(revisits.landmark, frame.landmark[frame.landmark >= 0])
+    np.testing.assert_array_equal(revisits.landmark, frame.tracked)
     T_cw = revisits.T_c_keyframe[0] @ mapper.map.keyframe_pose(0)
     np.testing.assert_allclose(T_cw, frame.T_cw, atol=1e-12)
     kept = [add_revisit(mapper.map, 0, frame, 1) for _ in range(2 * MAX_REVISITS)]
@@ -556,19 +538,19 @@ def test_an_old_keyframe_can_serve_in_place_of_a_new_one(is_due):
     assert mapper.frames.table().reference[-1] == 0
     np.testing.assert_allclose(mapper.frames.pose(-1), frame.T_cw, atol=1e-12)
     assert mapper.last_frame == (frame.index if is_due else 3)
-    assert (mapper.is_mapping, mapper.is_merged) == (is_due, not is_due)
+    assert (mapper.is_mapping, mapper.is_published) == (is_due, not is_due)
     drive.step()
     assert drive.closing.finished == 0
     drive.step()  # two frames later
     assert drive.closing.finished == is_due
-    assert mapper.is_merged
+    assert mapper.is_published
 
 
 def with_an_image(frame):
     """Give a frame the pyramid of an image of noise, from which patches can be taken."""
     image = np.random.default_rng(0).integers(0, 256, (CAMERA.height, CAMERA.width), np.uint8)
-    frame.pyramid = build_pyramid(image, Config().orb)
-    return frame
+    pyramid = build_pyramid(image, Config().orb)
+    return replace(frame, extracted=replace(frame.extracted, pyramid=pyramid))
 
 
 def test_at_a_known_place_the_patches_are_those_of_the_frame_until_the_next_keyframe():
@@ -583,14 +565,15 @@ def test_at_a_known_place_the_patches_are_those_of_the_frame_until_the_next_keyf
     feature = np.array([of_frame[k] for k in shown.ids.tolist()])
     np.testing.assert_array_equal(
         shown.pixels[shown.where],
-        patches_around(frame.pyramid, frame.features.xy[feature], frame.features.octave[feature]),
+        patches_around(
+            frame.extracted.pyramid, frame.features.xy[feature], frame.features.octave[feature]
+        ),
     )
     np.testing.assert_array_equal(shown.angle, frame.features.angle[feature])
     np.testing.assert_allclose(shown.T_cw[shown.view[0]], frame.T_cw, atol=1e-12)
 
     again = Mapper(
-        drive.context, drive.closing, drive.rig, Workers(1), mapper.map.copy(),
-        mapper.frames.table(),
+        drive.context, drive.closing, Workers(1), mapper.map.copy(), mapper.frames.table()
     )  # fmt: skip
     again.restore(mapper.state())
     assert bytes_of_view(again.view) == bytes_of_view(mapper.view)
@@ -604,18 +587,19 @@ def test_far_points_are_mapped_of_the_first_keyframe_while_it_is_the_only_one():
     drive = Drive()
     frame = drive.step(keyframe=True)
     near, n = drive.mapper.view, np.count_nonzero(frame.landmark >= 0)
-    assert not drive.mapper.map_far_points(drive.next_frame())  # not the frame of the keyframe
-    assert drive.mapper.map_far_points(frame)
-    assert n < np.count_nonzero(frame.landmark >= 0) == 240
+    # Another frame is not the frame of the keyframe.
+    assert drive.mapper.map_far_points(drive.next_frame()) is None
+    frame = drive.mapper.map_far_points(frame)
+    assert n < len(frame.tracked) == 240
     assert len(drive.mapper.view.local_landmarks.ids) == 240 > len(near.local_landmarks.ids)
     assert np.isfinite(frame.xyz).all()
-    assert not drive.mapper.map_far_points(frame)  # there are no more far points
+    assert drive.mapper.map_far_points(frame) is None  # there are no more far points
     drive = Drive()
     first = drive.step(keyframe=True)
     second = drive.step(keyframe=True)
-    assert not drive.mapper.map_far_points(second)
+    assert drive.mapper.map_far_points(second) is None
     drive.mapper.refer_to(0)
-    assert not drive.mapper.map_far_points(first)
+    assert drive.mapper.map_far_points(first) is None
 
 
 # -- failures -------------------------------------------------------------------------------------
@@ -636,13 +620,13 @@ def fail(map_: Map, keyframe: int) -> None:
 @pytest.mark.parametrize(
     "first",
     [
-        lambda drive: drive.mapper.merge(),
-        lambda drive: drive.mapper.complete(),
+        lambda drive: drive.mapper.publish(),
+        lambda drive: drive.mapper.wait(),
         lambda drive: drive.mapper.finish(),
-        lambda drive: drive.mapper.insert(drive.last),
+        lambda drive: drive.mapper.insert(drive.last, None),
         lambda drive: drive.steps([], 6),
     ],
-    ids=["merge", "complete", "finish", "insert", "drive"],
+    ids=["publish", "wait", "finish", "insert", "drive"],
 )
 def test_a_job_that_fails_says_so_once_and_the_map_says_so_from_then_on(workers, first):
     drive = Drive(workers(), Closing(fail), merge_after_frames=3)
@@ -651,17 +635,19 @@ def test_a_job_that_fails_says_so_once_and_the_map_says_so_from_then_on(workers,
     view, pose = mapper.view, mapper.frames.pose(-1).tobytes()
     with pytest.raises(BrokenError):
         first(drive)
-    start = TwoViewStart(frame, frame, at(1), (np.arange(2), np.arange(2)), POINTS.xyz[:2])
+    two, none = np.arange(2), (None, None)
+    start = TwoViewStart(frame, frame, none, at(1), (two, two), POINTS.xyz[:2])
     for use in (
         lambda: mapper.map,
-        mapper.merge,
-        mapper.complete,
+        mapper.publish,
+        mapper.settle,
+        mapper.wait,
         mapper.finish,
         mapper.trajectory,
-        lambda: mapper.merge_if_due(99),
-        lambda: mapper.insert(frame),
+        lambda: mapper.publish(frame=99),
+        lambda: mapper.insert(frame, None),
         lambda: mapper.map_far_points(frame),
-        lambda: mapper.begin(start, lambda: None),
+        lambda: mapper.begin(start),
         lambda: mapper.find_old_place(frame),
         lambda: mapper.refer_to(0),
         lambda: mapper.refer_to_nearest(frame),
@@ -691,7 +677,7 @@ def test_a_change_that_fails_where_no_job_runs_leaves_no_other_map(failing, chan
     drive = Drive(closing=Closing(fail), see=see_without_depth)
     with pytest.raises(BrokenError):
         change(drive)
-    for use in (lambda: drive.mapper.map, drive.mapper.complete, drive.mapper.finish):
+    for use in (lambda: drive.mapper.map, drive.mapper.wait, drive.mapper.finish):
         with pytest.raises(RuntimeError, match=INCOMPLETE):
             use()
 
@@ -758,11 +744,11 @@ def test_a_mapper_that_is_restored_goes_on_as_the_one_that_was_not():
     """The reference keyframe is not the newest one, as after relocalisation."""
     one = Drive()
     one.steps([0, 3], 6)
-    one.mapper.append_pose(one.next_frame(), tracked=True, near=0)
-    state, map_ = one.mapper.state(), one.mapper.complete()
+    one.mapper.record(replace(one.next_frame(), near=0))
+    state, map_ = one.mapper.state(), one.mapper.wait()
     other = Drive()
     other.mapper = Mapper(
-        other.context, other.closing, other.rig, Workers(1), map_.copy(), one.mapper.frames.table()
+        other.context, other.closing, Workers(1), map_.copy(), one.mapper.frames.table()
     )
     assert other.mapper.reference == 1  # the newest keyframe, where nothing else is known
     other.mapper.restore(state)
@@ -809,7 +795,7 @@ def test_only_the_same_drive_counts_frames_from_its_newest_keyframe(same_drive):
     map_ = one.mapper.map.copy()
     if not same_drive:
         map_.begin_drive()
-    other = Mapper(one.context, one.closing, one.rig, Workers(1), map_, one.mapper.frames.table())
+    other = Mapper(one.context, one.closing, Workers(1), map_, one.mapper.frames.table())
     other.continue_drive()
     assert other.last_frame == (3 if same_drive else -1)
     assert other.last_timestamp == (map_.timestamps[1] if same_drive else -np.inf)

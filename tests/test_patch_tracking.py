@@ -14,12 +14,12 @@ from vslam.context import Context
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import Perturbation
 from vslam.errors import UnreadableImageError
-from vslam.features import TrackingState
+from vslam.features import Extracted, TrackingState
 from vslam.frontend.extraction import FrameImages
-from vslam.frontend.frame import Frame
 from vslam.frontend.orb import build_pyramid, level_shapes
 from vslam.frontend.patch_tracking import track_patches
 from vslam.frontend.pose_alignment import align_pose, coarse_levels, coarse_pyramid, coarse_shapes
+from vslam.frontend.track import GivenFeatures
 from vslam.frontend.tracker import Tracker
 from vslam.frontend.tracking import feature_depth
 from vslam.geometry import inverse, se3_exp, se3_log, transform
@@ -140,20 +140,24 @@ def test_image_alignment_that_follows_a_moving_object_is_not_believed(corridor, 
     assert by_patches[1] > 0.5 * by_patches[0]
 
 
+def inverted(extracted: Extracted) -> Extracted:
+    features = extracted.features
+    return replace(extracted, features=replace(features, descriptors=~features.descriptors))
+
+
 def test_a_keyframe_is_made_where_patches_are_found_even_if_no_descriptor_matches(
     corridor, monkeypatch
 ):
-    changed = []
-    extract = Frame.extract
+    changed, match_features = [], Tracker.match_features
 
-    def extract_in_another_light(frame, camera):
-        by_patches = frame.source is not None and len(frame.features) > 0
-        extract(frame, camera)
-        if by_patches and frame.index > 8 and not changed:
-            changed.append(frame.index)
-            frame.features = replace(frame.features, descriptors=~frame.features.descriptors)
+    def match_in_another_light(tracker, track, images, view):
+        if track.index > 8 and not changed:
+            changed.append(track.index)
+            seen = track.features
+            images = GivenFeatures(inverted(images.extracted_with((seen.xy, seen.octave))))
+        return match_features(tracker, track, images, view)
 
-    monkeypatch.setattr(Frame, "extract", extract_in_another_light)
+    monkeypatch.setattr(Tracker, "match_features", match_in_another_light)
     slam, results = driven(corridor)
     (index,) = changed
     assert results[index].is_keyframe
@@ -166,22 +170,23 @@ def test_a_keyframe_is_made_where_patches_are_found_even_if_no_descriptor_matche
 def test_patches_that_agree_less_are_used_only_where_features_fail(
     corridor, monkeypatch, share, state
 ):
-    def track(self, frame, *rest):
-        found = all_patches(self, frame, *rest)
-        return found._replace(n_matches=int(len(found.ids) / share)) if frame.index == 9 else found
+    def find(self, images, predicted, *rest):
+        found = all_patches(self, images, predicted, *rest)
+        few = predicted.index == 9
+        return found._replace(n_matches=int(len(found.ids) / share)) if few else found
 
-    def extract_nothing_known(frame, camera):
-        extract(frame, camera)
-        if frame.index == 9:
-            descriptors = ~frame.features.descriptors
-            frame.features = replace(frame.features, descriptors=descriptors)
+    def extract_nothing_known(self, images, predicted, view):
+        track = extract(self, images, predicted, view)
+        if predicted.index == 9:
+            track = replace(track, extracted=inverted(track.extracted))
+        return track
 
-    all_patches, extract = Tracker.track_patches, Frame.extract
-    monkeypatch.setattr(Tracker, "track_patches", track)
+    all_patches, extract = Tracker._find_patches, Tracker.extract
+    monkeypatch.setattr(Tracker, "_find_patches", find)
     _, by_features = driven(corridor, frames=11)
     assert by_features[9].state == TrackingState.OK
     assert by_features[9].n_features > 0
-    monkeypatch.setattr(Frame, "extract", extract_nothing_known)
+    monkeypatch.setattr(Tracker, "extract", extract_nothing_known)
     _, results = driven(corridor, frames=11)
     assert results[9].state == state
     error = np.linalg.norm((inverse(results[9].T_wc) @ corridor.T_wc[9])[:3, 3])

@@ -2,55 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from parts import ALL, CAMERA, Points, frame_of
 
 from vslam.config import Config
 from vslam.context import Context
-from vslam.frontend.frame import Frame
+from vslam.frontend.track import Track
 from vslam.geometry import se3_exp, se3_log, transform
-from vslam.starter import OneViewStart, Starter, TwoViewStart
+from vslam.starter import Starter, TwoViewStart
 
 POINTS = Points.create()
-LEFT_CAMERA = CAMERA.left_camera()
 ASIDE = np.array([-1.0, 0.0, 0.1, 0.0, 0.01, 0.0])  # twist to a view from which points are mapped
 
 
-def starter(camera=LEFT_CAMERA, **thresholds: float) -> Starter:
+def starter(**thresholds: float) -> Starter:
     config = Config.model_validate({"initialization": thresholds})
-    return Starter(Context.create(camera, config))
+    return Starter(Context.create(CAMERA.left_camera(), config))
 
 
-def frame(
-    index: int, seconds: float, moved: float = 0.0, among: slice = ALL, camera=LEFT_CAMERA
-) -> Frame:
+def frame(index: int, seconds: float, moved: float = 0.0, among: slice = ALL) -> Track:
     """Make a frame that is not tracked.
 
     It has ``moved`` times the lateral distance that two views should have.
     """
     features = POINTS.see(se3_exp(moved * ASIDE), among)
-    if camera.monocular:
-        features.u_right[:] = np.nan
-    return frame_of(features, index, seconds, camera=camera)
-
-
-# -- one view -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("camera", [CAMERA, replace(CAMERA, depth=True)], ids=["stereo", "depth"])
-@pytest.mark.parametrize(("n_stereo", "enough"), [(100, True), (99, False)])
-def test_a_frame_with_enough_depths_begins_a_map_alone(camera, n_stereo, enough):
-    one, seen = starter(camera), frame(0, 0.0, camera=camera)
-    seen.features.u_right[n_stereo:] = np.nan
-    start = one.offer(seen)
-    assert (start is not None) == enough
-    if start is not None:
-        assert isinstance(start, OneViewStart)
-        assert start.frame is seen
-    assert not one.is_waiting
+    features.u_right[:] = np.nan
+    return frame_of(features, index, seconds)
 
 
 # -- two views ------------------------------------------------------------------------------------
@@ -59,14 +37,14 @@ def test_a_frame_with_enough_depths_begins_a_map_alone(camera, n_stereo, enough)
 @pytest.mark.parametrize(("n_features", "enough"), [(200, True), (199, False)])
 def test_a_frame_with_enough_features_waits_for_a_second_view(n_features, enough):
     one = starter()
-    assert one.offer(frame(0, 0.0, among=slice(0, n_features))) is None
+    assert one.offer(frame(0, 0.0, among=slice(0, n_features)), None) is None
     assert one.is_waiting == enough
 
 
 def test_two_views_from_different_places_begin_a_map():
     one, first, second = starter(), frame(0, 0.0), frame(1, 0.5, 1.0)
-    assert one.offer(first) is None
-    start = one.offer(second)
+    assert one.offer(first, None) is None
+    start = one.offer(second, None)
     assert isinstance(start, TwoViewStart)
     assert start.first is first
     assert start.second is second
@@ -88,9 +66,9 @@ def test_two_views_from_different_places_begin_a_map():
 
 def test_a_camera_that_stands_begins_no_map_and_the_first_view_keeps_waiting():
     one, first = starter(), frame(0, 0.0)
-    assert one.offer(first) is None
-    assert one.offer(frame(1, 0.1, 1e-4)) is None
-    start = one.offer(frame(2, 0.2, 1.0))
+    assert one.offer(first, None) is None
+    assert one.offer(frame(1, 0.1, 1e-4), None) is None
+    start = one.offer(frame(2, 0.2, 1.0), None)
     assert isinstance(start, TwoViewStart)
     assert start.first is first
 
@@ -98,11 +76,11 @@ def test_a_camera_that_stands_begins_no_map_and_the_first_view_keeps_waiting():
 @pytest.mark.parametrize(("seconds", "together"), [(1.5, True), (1.501, False)])
 def test_a_view_that_has_waited_too_long_is_replaced(seconds, together):
     one, second = starter(), frame(1, seconds, 1.0)
-    one.offer(frame(0, 0.0))
-    start = one.offer(second)
+    one.offer(frame(0, 0.0), None)
+    start = one.offer(second, None)
     assert (start is not None) == together
     if not together:
-        start = one.offer(frame(2, seconds + 0.1, 2.0))
+        start = one.offer(frame(2, seconds + 0.1, 2.0), None)
         assert isinstance(start, TwoViewStart)
         assert start.first is second
 
@@ -116,29 +94,29 @@ def test_a_view_that_shows_too_little_of_the_first_one_replaces_it(n_common, tog
     one, second = starter(min_landmarks=50, min_points=20), frame(1, 0.1, 1.0)
     strange = np.random.default_rng(1).integers(0, 256, (240 - n_common, 32), dtype=np.uint8)
     second.features.descriptors[:] = np.vstack([POINTS.descriptors[:n_common], strange])
-    one.offer(frame(0, 0.0))
-    start = one.offer(second)
+    one.offer(frame(0, 0.0), None)
+    start = one.offer(second, None)
     assert (start is not None) == together
     if start is None:
         third = frame(2, 0.2, 2.0)
         third.features.descriptors[:] = second.features.descriptors
-        start = one.offer(third)
+        start = one.offer(third, None)
         assert isinstance(start, TwoViewStart)
         assert start.first is second
 
 
 def test_a_view_that_shows_too_little_of_the_first_one_and_too_little_at_all_is_not_kept():
     one = starter()
-    one.offer(frame(0, 0.0))
-    assert one.offer(frame(1, 0.1, 1.0, slice(0, 99))) is None
+    one.offer(frame(0, 0.0), None)
+    assert one.offer(frame(1, 0.1, 1.0, slice(0, 99)), None) is None
     assert not one.is_waiting
 
 
 @pytest.mark.parametrize(("min_landmarks", "enough"), [(240, True), (241, False)])
 def test_a_map_needs_enough_points_to_begin_with(min_landmarks, enough):
     one = starter(min_landmarks=min_landmarks)
-    one.offer(frame(0, 0.0))
-    assert (one.offer(frame(1, 0.1, 1.0)) is not None) == enough
+    one.offer(frame(0, 0.0), None)
+    assert (one.offer(frame(1, 0.1, 1.0), None) is not None) == enough
     assert one.is_waiting
 
 
@@ -149,7 +127,7 @@ def two_views() -> TwoViewStart:
     T_2_1 = se3_exp(np.array([0.3, 0.0, 0.4, 0.0, 0.02, 0.0]))
     T_2_1[:3, 3] *= 0.5 / np.linalg.norm(T_2_1[:3, 3])
     features = np.arange(240), np.arange(240)
-    return TwoViewStart(frame(4, 1.0), frame(6, 1.25), T_2_1, features, POINTS.xyz)
+    return TwoViewStart(frame(4, 1.0), frame(6, 1.25), (None, None), T_2_1, features, POINTS.xyz)
 
 
 def test_a_sub_map_takes_its_unit_from_the_speed_before():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,14 +10,16 @@ from parts import ALL, CAMERA, NOTHING, OneKeyframe, Points, ahead, frame_of
 
 from vslam.config import Config
 from vslam.context import Context
-from vslam.features import NO_PATCHES, Features, TrackingState
+from vslam.features import NO_PATCHES, Extracted, Features, TrackingState
 from vslam.frame_poses import FramePoses
-from vslam.frontend.frame import Frame
 from vslam.frontend.patch_tracking import NO_PATCHES_FOUND, PatchTrack
-from vslam.frontend.tracker import Found, Tracker, TrackerStatus, judge
-from vslam.frontend.tracking import track_descriptors, track_motion, trusted_landmarks
+from vslam.frontend.track import By, GivenFeatures, Prediction, Track
+from vslam.frontend.tracker import Tracker, judge_patches
+from vslam.frontend.tracking import judge, track_descriptors, track_motion, trusted_landmarks
 from vslam.geometry import se3_exp
 from vslam.map_view import NO_LANDMARKS, MapView
+from vslam.motion import Motion
+from vslam.session import restored_track, tracker_state
 
 CONTEXT = Context.create(CAMERA, Config())
 POINTS = Points.create()
@@ -30,13 +32,6 @@ TWIST = STEP / 0.1  # at ten frames per second
 def at(k: float) -> np.ndarray:
     """Return ``T_cw`` at frame k of a camera that moves at a constant speed."""
     return se3_exp(k * STEP)
-
-
-def restored(tracker: Tracker) -> Tracker:
-    """Return a new tracker in the same map with the memory of the given tracker."""
-    state, other = tracker.state(), Tracker(CONTEXT)
-    other.restore(state, np.where((state.landmark >= 0)[:, None], POINTS.xyz, np.nan))
-    return other
 
 
 def select(features: Features, n: int) -> Features:
@@ -53,6 +48,8 @@ class Drive:
     def __init__(self) -> None:
         self.tracker = Tracker(CONTEXT)
         self.frames = FramePoses(OneKeyframe())
+        self.motion = Motion(CONTEXT, self.frames)
+        self.last: Track | None = None
 
     @classmethod
     def of_two_frames(cls, among: slice = ALL) -> Drive:
@@ -65,37 +62,48 @@ class Drive:
         drive.accept(1, among)
         return drive
 
-    def accept(self, k: int, among: slice = ALL, *, keyframe: int = -1) -> Frame:
-        """Continue from a frame that was found, with a ``keyframe`` if by relocalisation."""
+    def accept(self, k: int, among: slice = ALL, *, by: By = By.FEATURES) -> Track:
+        """Continue from a frame that was found at the true pose of frame k."""
         frame = POINTS.tracked_frame(len(self.frames), 0.1 * k, at(k), among)
-        found = Found(TrackingState.OK, keyframe=keyframe)
-        if k == 0:
-            self.tracker.start_from(frame)
-        else:
-            self.tracker.accept(frame, found, self.frames, 1)
-        self.frames.append(frame.timestamp, frame.T_cw, tracked=True)
+        return self.follow(replace(frame, by=by))
+
+    def follow(self, frame: Track) -> Track:
+        """Continue from a frame, and return it with its velocity. The first frame has none."""
+        predicted = self.expected(frame.timestamp)
+        if self.last is not None:
+            frame = self.motion.advance(frame, predicted, POINTS.view(n_keyframes=1))
+        self.frames.append(frame.timestamp, frame.T_cw, tracked=not frame.is_lost)
+        self.last = self.last if frame.is_lost else frame
         return frame
 
     def lose(self, k: int) -> None:
         """Continue from a frame that is not tracked, at its predicted pose."""
-        T_cw = self.predict(k)
-        self.frames.append(0.1 * k, T_cw, tracked=False)
-        self.tracker.lose()
+        self.follow(self.expected(0.1 * k).lost)
+
+    def expected(self, timestamp: float, view: MapView | None = None) -> Prediction:
+        return self.motion.predict(timestamp, self.last, view or POINTS.view())
 
     def predict(self, k: float) -> np.ndarray:
-        return self.tracker.predict(0.1 * k, self.frames, POINTS.view())
+        return self.expected(0.1 * k).T_cw
 
-    def next_frame(self, among: slice = ALL, *, seconds: float = 0.1) -> Frame:
+    def next_frame(self, among: slice = ALL, *, seconds: float = 0.1) -> Track:
         """Return the frame after the last one, which sees some of the points."""
         last = self.frames.timestamp(-1)
         return POINTS.frame(len(self.frames), last + seconds, at(10.0 * (last + seconds)), among)
 
-    def track(self, frame: Frame, view: MapView, T_cw: np.ndarray | None = None) -> Found:
+    def track(self, frame: Track, view: MapView, T_cw: np.ndarray | None = None) -> Track:
         """Track a frame from a predicted pose, which is by default its true pose."""
         T_cw = at(10.0 * frame.timestamp) if T_cw is None else T_cw
-        return self.tracker.track(frame, T_cw, view, self.frames)
+        predicted = replace(self.expected(frame.timestamp, view), T_cw=T_cw)
+        images = GivenFeatures(frame.extracted)
+        seen = self.tracker.extract(images, predicted, view)
+        return self.tracker.track_features(seen, images, predicted, view)
 
-    def doubts(self, frame: Frame, view: MapView) -> bool:
+    @property
+    def stands_still(self) -> bool:
+        return self.last is not None and self.last.still is not None
+
+    def doubts(self, frame: Track, view: MapView) -> bool:
         """Track a frame at its true pose, and return whether the result is doubtful."""
         return self.track(frame, view).is_doubtful
 
@@ -105,8 +113,7 @@ class Drive:
 
 def test_without_any_frame_the_camera_is_expected_at_the_reference_keyframe():
     view = replace(POINTS.view(), T_reference=ahead(3.0, 0.2))
-    T_cw = Tracker(CONTEXT).predict(0.0, FramePoses(OneKeyframe()), view)
-    np.testing.assert_array_equal(T_cw, ahead(3.0, 0.2))
+    np.testing.assert_array_equal(Drive().expected(0.0, view).T_cw, ahead(3.0, 0.2))
 
 
 def test_a_camera_whose_speed_is_unknown_is_expected_where_it_was():
@@ -118,7 +125,7 @@ def test_a_camera_whose_speed_is_unknown_is_expected_where_it_was():
 @pytest.mark.parametrize("k", [2, 4.5])
 def test_the_speed_is_per_second_so_that_dropped_frames_do_not_disturb_it(k):
     drive = Drive.of_two_frames()
-    np.testing.assert_allclose(drive.tracker.twist, TWIST, atol=1e-9)
+    np.testing.assert_allclose(drive.last.twist, TWIST, atol=1e-9)
     np.testing.assert_allclose(drive.predict(k), at(k), atol=1e-9)
 
 
@@ -128,14 +135,8 @@ def test_frames_that_were_stamped_on_arrival_are_taken_as_equally_spaced():
     stamps = np.cumsum([0, *[58, 58, 23, 1] * 3]) / 1000.0
     for k, stamp in enumerate(stamps[:-1]):
         if k > 8:
-            predicted = drive.tracker.predict(stamp, drive.frames, POINTS.view())
-            np.testing.assert_allclose(predicted, at(k), atol=0.1)
-        frame = POINTS.tracked_frame(k, stamp, at(k), FEW)
-        if k:
-            drive.tracker.accept(frame, Found(TrackingState.OK), drive.frames, 1)
-        else:
-            drive.tracker.start_from(frame)
-        drive.frames.append(stamp, frame.T_cw, tracked=True)
+            np.testing.assert_allclose(drive.expected(stamp).T_cw, at(k), atol=0.1)
+        drive.follow(POINTS.tracked_frame(k, stamp, at(k), FEW))
 
 
 def test_the_camera_moves_on_while_it_is_lost():
@@ -158,9 +159,7 @@ def test_the_speed_is_measured_from_the_last_frame_that_was_tracked():
 def test_the_leap_to_where_a_frame_was_found_in_the_map_is_no_motion():
     drive = Drive.of_two_frames()
     drive.lose(2)
-    frame = drive.accept(30, keyframe=4)
-    assert frame.twist is None
-    assert drive.tracker.twist is None
+    assert drive.accept(30, by=By.PLACE).twist is None
 
 
 # -- what is tracked ------------------------------------------------------------------------------
@@ -168,33 +167,29 @@ def test_the_leap_to_where_a_frame_was_found_in_the_map_is_no_motion():
 
 def test_a_tracker_that_has_nothing_to_go_on_does_not_track():
     drive = Drive()
-    assert drive.tracker.status is TrackerStatus.UNKNOWN
-    frame = POINTS.frame(0, 0.0, np.eye(4))
-    found = drive.track(frame, POINTS.view(), np.eye(4))
+    found = drive.track(POINTS.frame(0, 0.0, np.eye(4)), POINTS.view(), np.eye(4))
     assert found.is_lost
-    assert (frame.landmark == -1).all()
+    assert (found.landmark == -1).all()
 
 
 def test_a_drive_that_is_continued_is_tracked_from_the_reference_keyframe():
     drive = Drive()
-    drive.tracker.resume()
-    assert drive.tracker.status is TrackerStatus.RESUMED
-    frame = POINTS.frame(0, 0.0, ahead(0.7, 0.1))
-    found = drive.track(frame, POINTS.view(), np.eye(4))
+    drive.motion.resume()
+    found = drive.track(POINTS.frame(0, 0.0, ahead(0.7, 0.1)), POINTS.view(), np.eye(4))
     assert (found.state, found.n_inliers) == (TrackingState.OK, 240)
-    np.testing.assert_array_equal(frame.landmark, np.arange(240))
-    np.testing.assert_allclose(frame.T_cw, ahead(0.7, 0.1), atol=1e-4)
+    np.testing.assert_array_equal(found.landmark, np.arange(240))
+    np.testing.assert_allclose(found.T_cw, ahead(0.7, 0.1), atol=1e-4)
 
 
 def test_a_continued_drive_has_the_speed_that_it_is_told():
     drive = Drive()
     drive.frames.append(0.0, at(0), tracked=True)
-    drive.tracker.resume(TWIST)
+    drive.motion.resume(TWIST)
     np.testing.assert_allclose(drive.predict(3), at(3), atol=1e-12)
     # With the prediction, a frame is found that the reference keyframe does not show.
     frame, view = drive.next_frame(), POINTS.view(nearest=NOTHING)
     assert drive.track(frame, view).n_inliers == 240
-    drive.tracker.resume(None)
+    drive.motion.resume(None)
     assert drive.track(drive.next_frame(), view).is_lost
 
 
@@ -210,7 +205,7 @@ def test_what_the_last_frame_saw_is_looked_for_near_the_prediction(pixels, found
     assert found.is_lost != found_again
     if found_again:
         assert found.n_inliers == 240
-        np.testing.assert_allclose(frame.T_cw, at(2), atol=1e-4)
+        np.testing.assert_allclose(found.T_cw, at(2), atol=1e-4)
 
 
 def test_where_the_last_frame_shows_other_things_the_reference_keyframe_is_tried():
@@ -220,8 +215,8 @@ def test_where_the_last_frame_shows_other_things_the_reference_keyframe_is_tried
     frame = drive.next_frame(frame_sees)
     found = drive.track(frame, POINTS.view(nearest=SEEN_NOW), T_predicted)
     assert found.n_inliers == 120
-    np.testing.assert_array_equal(frame.landmark, np.arange(120, 240))
-    np.testing.assert_allclose(frame.T_cw, at(2), atol=1e-4)
+    np.testing.assert_array_equal(found.landmark, np.arange(120, 240))
+    np.testing.assert_allclose(found.T_cw, at(2), atol=1e-4)
     assert drive.track(
         drive.next_frame(frame_sees), POINTS.view(nearest=SEEN_LAST), T_predicted
     ).is_lost
@@ -236,10 +231,10 @@ def test_where_neither_is_recognised_all_around_is_looked_for_near_the_predictio
     frame = drive.next_frame(SEEN_NOW)
     found = drive.track(frame, view, ahead(0.0, pixels / CAMERA.fx) @ at(2))
     assert found.n_inliers == (120 if found_again else 0)
-    assert (frame.landmark >= 0).all() == found_again
-    assert np.isfinite(frame.xyz).all() == found_again
+    assert (found.landmark >= 0).all() == found_again
+    assert np.isfinite(found.xyz).all() == found_again
     if found_again:
-        np.testing.assert_allclose(frame.T_cw, at(2), atol=1e-4)
+        np.testing.assert_allclose(found.T_cw, at(2), atol=1e-4)
 
 
 @pytest.mark.parametrize("last_saw", [SEEN_LAST, ALL], ids=["predicted", "motion"])
@@ -247,8 +242,9 @@ def test_where_neither_is_recognised_all_around_is_looked_for_near_the_predictio
 def test_a_prediction_with_few_inliers_is_not_trusted(last_saw, n_inliers, found_again):
     drive, view = Drive.of_two_frames(last_saw), POINTS.view(nearest=NOTHING)
     frame = drive.next_frame(slice(240 - n_inliers, 240))
-    assert drive.track(frame, view).is_lost != found_again
-    assert (frame.landmark >= 0).all() == found_again
+    found = drive.track(frame, view)
+    assert found.is_lost != found_again
+    assert (found.landmark >= 0).all() == found_again
 
 
 @pytest.mark.parametrize("last_saw", [SEEN_LAST, ALL], ids=["predicted", "motion"])
@@ -267,14 +263,12 @@ def test_a_frame_after_a_sudden_turn_is_tracked_from_the_last_frame(pixels, foun
     """Optimisation that starts at the predicted pose fails, because the turn is too large."""
     drive, view = Drive.of_two_frames(), POINTS.view(nearest=NOTHING)
     frame, T_predicted = drive.next_frame(), ahead(0.0, pixels / CAMERA.fx) @ at(2)
-    assert (
-        track_motion(drive.next_frame(), drive.tracker.last, T_predicted, NO_LANDMARKS, CONTEXT)[1]
-        == 0
-    )
+    near = track_motion(drive.next_frame(), drive.last, T_predicted, NO_LANDMARKS, CONTEXT)
+    assert near.n_inliers == 0
     found = drive.track(frame, view, T_predicted)
     assert found.is_lost != found_again
     if found_again:
-        np.testing.assert_allclose(frame.T_cw, at(2), atol=1e-4)
+        np.testing.assert_allclose(found.T_cw, at(2), atol=1e-4)
 
 
 @pytest.mark.parametrize(("n_wrong", "found_again"), [(140, True), (150, False)])
@@ -289,7 +283,7 @@ def test_a_sudden_turn_needs_a_large_share_of_inliers(n_wrong, found_again):
     found = drive.track(frame, view, ahead(0.0, 60 / CAMERA.fx) @ at(2))
     assert found.is_lost != found_again
     if found_again:
-        np.testing.assert_allclose(frame.T_cw, at(2), atol=1e-4)
+        np.testing.assert_allclose(found.T_cw, at(2), atol=1e-4)
 
 
 def test_after_a_lost_frame_no_sudden_turn_is_expected():
@@ -313,10 +307,9 @@ def test_a_found_frame_tracks_all_landmarks_around_and_says_which_it_should_see(
     drive = Drive.of_two_frames(FEW)
     frame = drive.next_frame()
     found = drive.track(frame, points.view())
-    np.testing.assert_array_equal(frame.landmark, np.arange(240))
+    np.testing.assert_array_equal(found.landmark, np.arange(240))
     np.testing.assert_array_equal(found.visible, np.arange(240))
-    assert (found.n_matches, found.n_inliers) == (240, 240)
-    assert not found.relocalised
+    assert (found.n_matches, found.n_inliers, found.by) == (240, 240, By.FEATURES)
 
 
 @pytest.mark.parametrize(("n_matches", "n_inliers", "state"), [
@@ -343,7 +336,7 @@ def test_a_small_share_of_inliers_makes_a_frame_of_a_depth_camera_lost(n_inliers
 OBJECT = ahead(0.0, 60 / CAMERA.fx)  # motion of the camera relative to a moving object
 
 
-def see_object(static: slice, moving: slice, T_static: np.ndarray, T_object: np.ndarray) -> Frame:
+def see_object(static: slice, moving: slice, T_static: np.ndarray, T_object: np.ndarray) -> Track:
     """Return frame 2, which sees points at rest from one pose, and an object from another pose."""
     at_rest, others = POINTS.see(T_static, static), POINTS.see(T_object, moving)
     names = ("xy", "octave", "angle", "descriptors", "u_right")
@@ -354,9 +347,10 @@ def see_object(static: slice, moving: slice, T_static: np.ndarray, T_object: np.
 def test_descriptors_find_the_pose_of_most_landmarks_although_an_object_was_nearer():
     unknown = POINTS.landmarks()._replace(confirmed=np.zeros(240, np.bool_))
     frame = see_object(slice(0, 140), slice(140, 240), at(2), OBJECT @ at(2))
-    assert track_descriptors(frame, unknown, OBJECT @ at(2), CONTEXT) == 140
-    np.testing.assert_allclose(frame.T_cw, at(2), atol=1e-4)
-    assert (frame.landmark[140:] == -1).all()
+    found = track_descriptors(frame, unknown, OBJECT @ at(2), CONTEXT)
+    assert found.n_inliers == 140
+    np.testing.assert_allclose(found.T_cw, at(2), atol=1e-4)
+    assert (found.landmark[140:] == -1).all()
 
 
 @pytest.mark.parametrize(("n_close", "n_chosen"), [(30, 30), (29, 79)])
@@ -405,13 +399,13 @@ def test_trusted_landmarks_support_a_pose_if_enough_are_expected(expected, trust
     (patches(15, stands_still=True, expected=30), TrackingState.OK),
 ])  # fmt: skip
 def test_patches_without_trusted_landmarks_are_not_believed(track, state):
-    assert Tracker(CONTEXT).judge_patches(track) == state
+    assert judge_patches(track, None, CONTEXT) == state
 
 
 def test_a_standing_camera_is_not_tracked_by_a_small_share_of_patches():
-    tracker = standing().tracker
-    assert tracker.judge_patches(patches(share=0.6)) == TrackingState.LOST
-    assert tracker.judge_patches(patches()) == TrackingState.OK
+    still = standing().last.still
+    assert judge_patches(patches(share=0.6), still, CONTEXT) == TrackingState.LOST
+    assert judge_patches(patches(), still, CONTEXT) == TrackingState.OK
 
 
 class Hypotheses:
@@ -436,13 +430,13 @@ class Hypotheses:
 
         monkeypatch.setattr(Tracker, "_align", align)
         monkeypatch.setattr("vslam.frontend.tracker.track_patches", track)
-        drive, frame = Drive.of_two_frames(), POINTS.frame(2, 0.2, at(2))
-        frame.pyramid = frame.source = object()
+        drive, images = Drive.of_two_frames(), GivenFeatures(Extracted.nothing(), pyramid=object())
         local = POINTS.landmarks()._replace(confirmed=np.arange(240) < n_confirmed)
         view = replace(
             POINTS.view(), local_landmarks=local, patches=NO_PATCHES._replace(ids=np.arange(1))
         )
-        found = drive.tracker.track_patches(frame, poses["predicted"], view, drive.frames)
+        predicted = replace(drive.expected(0.2), T_cw=poses["predicted"])
+        found = drive.tracker._find_patches(images, predicted, view, None)
         self.chosen = next((name for name, one in tracks.items() if one is found), None)
         self.found = found
 
@@ -511,12 +505,11 @@ def test_an_implausible_pose_without_support_is_not_believed(monkeypatch, metres
 STATIC, MOVING = slice(0, 192), slice(192, 240)  # the object moves by a pixel in the last frame
 
 
-def frame_by_patches(k: int, moved: slice = NOTHING, pixels: float = 0.0) -> Frame:
+def frame_by_patches(k: int, moved: slice = NOTHING, pixels: float = 0.0) -> Track:
     """Return frame k of a camera at rest, in which some points have moved to the right."""
     frame = POINTS.tracked_frame(k, 0.1 * k, np.eye(4))
     frame.features.xy[moved, 0] += pixels
-    frame.source = object()
-    return frame
+    return replace(frame, by=By.PATCHES)
 
 
 def standing(n: int = 240, moved: slice = MOVING, pixels: float = 1.0) -> Drive:
@@ -524,12 +517,7 @@ def standing(n: int = 240, moved: slice = MOVING, pixels: float = 1.0) -> Drive:
     drive = Drive()
     for k in range(2):
         frame = frame_by_patches(k, *((moved, pixels) if k else ()))
-        frame.landmark[n:], frame.xyz[n:] = -1, np.nan
-        if k:
-            drive.tracker.accept(frame, Found(TrackingState.OK), drive.frames, 1)
-        else:
-            drive.tracker.start_from(frame)
-        drive.frames.append(frame.timestamp, frame.T_cw, tracked=True)
+        drive.follow(frame.without(slice(n, None)))
     return drive
 
 
@@ -543,34 +531,32 @@ def standing(n: int = 240, moved: slice = MOVING, pixels: float = 1.0) -> Drive:
     (Drive.of_two_frames(), False),
 ])  # fmt: skip
 def test_a_camera_stands_still_if_landmarks_do_not_move_in_the_image(drive, stands):
-    assert drive.tracker.stands_still == stands
+    assert drive.stands_still == stands
 
 
 @pytest.mark.parametrize("why", ["features", "lost", "weak"])
 def test_only_two_consecutive_frames_that_were_tracked_by_patches_show_a_standstill(why):
     drive = Drive()
-    drive.tracker.start_from(frame_by_patches(0))
-    drive.frames.append(0.0, np.eye(4), tracked=True)
-    frame, state = frame_by_patches(1), TrackingState.OK
+    drive.follow(frame_by_patches(0))
+    k, by, state = 1, By.PATCHES, TrackingState.OK
     if why == "features":
-        frame.source = None
+        by = By.FEATURES
     if why == "lost":
-        drive.tracker.lose()
+        drive.lose(1)
+        k = 2
     if why == "weak":
         state = TrackingState.WEAK
-    drive.tracker.accept(frame, Found(state), drive.frames, 1)
-    assert not drive.tracker.stands_still
+    drive.follow(replace(frame_by_patches(k), by=by, state=state))
+    assert not drive.stands_still
 
 
 @pytest.mark.parametrize(("stands_still", "speed"), [(True, 0.0), (False, 0.4)])
 def test_a_standing_camera_has_no_speed(stands_still, speed):
     drive = standing()
-    frame = frame_by_patches(2, ALL, 5.0)
-    frame.T_cw = ahead(0.04)
-    found = Found(TrackingState.OK, stands_still=stands_still)
-    drive.tracker.accept(frame, found, drive.frames, 1)
-    assert np.linalg.norm(drive.tracker.twist) == pytest.approx(speed)
-    assert drive.tracker.stands_still == stands_still
+    by = By.STANDSTILL if stands_still else By.PATCHES
+    drive.follow(replace(frame_by_patches(2, ALL, 5.0), T_cw=ahead(0.04), by=by))
+    assert np.linalg.norm(drive.last.twist) == pytest.approx(speed)
+    assert drive.stands_still == stands_still
 
 
 def unconfirmed(n_keyframes: int = 1) -> MapView:
@@ -588,29 +574,16 @@ def test_what_a_standing_camera_saw_at_rest_is_trusted_until_there_is_a_new_keyf
     """The object has 48 landmarks, and 30 landmarks are at rest."""
     drive = standing()
     frame = see_object(slice(0, 30), MOVING, np.eye(4), ahead(0.0, 4.0 / CAMERA.fx))
-    found = drive.tracker.track(frame, np.eye(4), unconfirmed(n_keyframes), drive.frames)
+    found = drive.track(frame, unconfirmed(n_keyframes), np.eye(4))
     assert found.state == TrackingState.OK
-    np.testing.assert_allclose(frame.T_cw, ahead(0.0, turn / CAMERA.fx), atol=1e-4)
-    assert drive.tracker.stands_still == (n_keyframes == 1)
+    np.testing.assert_allclose(found.T_cw, ahead(0.0, turn / CAMERA.fx), atol=1e-4)
 
 
 @pytest.mark.parametrize(("n_static", "state"), [(30, TrackingState.OK), (29, TrackingState.LOST)])
 def test_features_of_a_moving_object_do_not_take_a_standing_camera_along(n_static, state):
     drive = standing()
     frame = see_object(slice(0, n_static), MOVING, np.eye(4), ahead(0.0, 4.0 / CAMERA.fx))
-    assert drive.tracker.track(frame, np.eye(4), unconfirmed(), drive.frames).state == state
-
-
-def test_a_standstill_is_part_of_the_state():
-    drive, moves = standing(), Drive.of_two_frames()
-    other = restored(drive.tracker)
-    assert other.stands_still
-    for field in fields(drive.tracker.state()):
-        mine, theirs = (getattr(one.state(), field.name) for one in (other, drive.tracker))
-        np.testing.assert_equal(mine, theirs, field.name)
-    np.testing.assert_array_equal(other.state().standstill.ids, np.arange(192))
-    other.restore(moves.tracker.state(), POINTS.xyz)
-    assert not other.stands_still
+    assert drive.track(frame, unconfirmed(), np.eye(4)).state == state
 
 
 # -- doubt ----------------------------------------------------------------------------------------
@@ -644,7 +617,7 @@ def test_a_frame_with_few_inliers_next_to_one_found_in_the_map_is_doubtful():
     """The motion of the camera between the two frames is unknown."""
     drive = Drive.of_two_frames(FEW)
     drive.lose(2)
-    drive.accept(3, FEW, keyframe=4)
+    drive.accept(3, FEW, by=By.PLACE)
     frame = drive.next_frame(FEW)
     assert drive.doubts(frame, POINTS.view(n_reference=121, n_keyframes=OLD))
     assert not drive.doubts(frame, POINTS.view(n_reference=120, n_keyframes=OLD))
@@ -664,7 +637,7 @@ def test_a_frame_that_lost_most_of_what_the_last_one_tracked_is_doubtful(n_befor
 
 def test_where_no_frame_was_tracked_before_nothing_is_doubtful():
     drive = Drive()
-    drive.tracker.resume()
+    drive.motion.resume()
     frame = POINTS.frame(0, 0.0, np.eye(4), FEW)
     assert not drive.doubts(frame, POINTS.view(n_reference=240, n_keyframes=OLD))
 
@@ -674,64 +647,36 @@ def test_where_no_frame_was_tracked_before_nothing_is_doubtful():
 
 def test_lost_frames_are_counted_until_one_is_found_or_begins_a_map():
     drive = Drive.of_two_frames()
-    tracker = drive.tracker
-    assert (tracker.status, tracker.lost_frames) == (TrackerStatus.TRACKING, 0)
-    last = tracker.last
+    last = drive.last
     drive.lose(2)
     drive.lose(3)
-    assert (tracker.status, tracker.lost_frames) == (TrackerStatus.LOST, 2)
-    assert tracker.last is last
-    frame = drive.accept(4)
-    assert (tracker.status, tracker.lost_frames) == (TrackerStatus.TRACKING, 0)
-    assert tracker.last is frame
+    predicted = drive.expected(0.4)
+    assert (predicted.lost_frames, predicted.is_tracking, predicted.last) == (2, False, last)
+    drive.accept(4)
+    assert drive.expected(0.5).is_tracking
     drive.lose(5)
-    start = POINTS.tracked_frame(6, 0.6, at(6))
-    tracker.start_from(start)
-    assert (tracker.status, tracker.lost_frames) == (TrackerStatus.TRACKING, 0)
-    assert tracker.last is start
+    drive.motion.keyframe()
+    assert drive.expected(0.6).is_tracking
 
 
-def test_before_the_first_frame_there_is_nothing_to_remember():
-    tracker = Tracker(CONTEXT)
-    assert tracker.state() is None
-    tracker.resume(TWIST)
-    assert tracker.state() is None
-
-
+@pytest.mark.parametrize("make", [lambda: Drive.of_two_frames(slice(0, 121)), standing])
 @pytest.mark.parametrize("lost", [0, 2])
-def test_a_tracker_that_is_restored_goes_on_as_the_one_that_was_not(lost):
-    """The last frame tracked 121 landmarks. The next frame tracks 60 landmarks."""
-    drive = Drive()
-    drive.accept(0)
-    last = POINTS.tracked_frame(1, 0.1, at(1))
-    last.landmark[121:], last.xyz[121:] = -1, np.nan
-    drive.tracker.accept(last, Found(TrackingState.OK), drive.frames, 1)
-    drive.frames.append(0.1, last.T_cw, tracked=True)
+def test_a_drive_that_is_restored_goes_on_as_the_one_that_was_not(make, lost):
+    """The last frame tracked 121 or 240 landmarks. The next frame tracks 60 landmarks."""
+    drive = make()
     for k in range(lost):
         drive.lose(2 + k)
-    other = restored(drive.tracker)
-    assert other.status is drive.tracker.status
-    assert other.lost_frames == lost
-    for field in fields(drive.tracker.state()):
-        mine, theirs = (getattr(one.state(), field.name) for one in (other, drive.tracker))
-        np.testing.assert_equal(mine, theirs, field.name)
+    state = tracker_state(drive.last, drive.motion.lost_frames)
+    last = replace(restored_track(state, CONTEXT), xyz=drive.last.xyz)
+    motion = Motion(CONTEXT, drive.frames)
+    motion.lost_frames = state.lost_frames
     view, outcomes = POINTS.view(nearest=NOTHING, n_reference=240, n_keyframes=OLD), []
-    for tracker in (drive.tracker, other):
-        frame = drive.next_frame(FEW)
-        T_cw = tracker.predict(frame.timestamp, drive.frames, view)
-        found = tracker.track(frame, T_cw, view, drive.frames)
-        assert (found.n_inliers, found.is_doubtful) == (60, True)
-        tracker.accept(frame, found, drive.frames, 1)
-        outcomes.append((T_cw.tobytes(), frame.T_cw.tobytes(), tracker.twist.tobytes()))
+    frame = drive.next_frame(FEW)
+    for one in ((drive.last, drive.motion), (last, motion)):
+        drive.last, drive.motion = one
+        predicted = drive.expected(frame.timestamp, view)
+        found = drive.track(frame, view, predicted.T_cw)
+        found = drive.motion.advance(found, predicted, view)
+        twist = found.twist
+        outcomes.append((found.n_inliers, found.is_doubtful, found.T_cw.tobytes(), str(twist)))
     assert outcomes[1] == outcomes[0]
-
-
-def test_what_is_remembered_does_not_change_with_the_frame():
-    drive = Drive.of_two_frames()
-    state, last = drive.tracker.state(), drive.tracker.last
-    last.landmark[:] = -1
-    last.twist[:] = 0.0
-    last.T_cw[:] = 0.0
-    assert state.landmark.tolist() == list(range(240))
-    np.testing.assert_allclose(state.twist, TWIST, atol=1e-9)
-    np.testing.assert_array_equal(state.T_cw, at(1))

@@ -44,7 +44,7 @@ STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("track by patches", (("vslam.frontend.tracker", "Tracker.track_patches"),)),
     ("match a keyframe's features", (("vslam.frontend.tracker", "Tracker.match_features"),)),
     ("track the previous frame", (("vslam.frontend.tracker", "Tracker._track_previous_frame"),)),
-    ("track the local map", (("vslam.frontend.tracker", "Tracker.track"),)),
+    ("track the local map", (("vslam.frontend.tracker", "Tracker.track_features"),)),
     ("insert keyframes", (("vslam.mapping", "Mapper.insert"),)),
     ("view of the map", (("vslam.mapping", "Mapper.refer_to"),)),
     ("triangulation", (("vslam.backend.local_mapping", "triangulate_with_neighbours"),)),
@@ -60,7 +60,7 @@ STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
             ("vslam.closing", "LoopClosing.finish"),
         ),
     ),
-    ("merge", (("vslam.mapping", "Mapper.merge"),)),
+    ("publish", (("vslam.mapping", "Mapper.publish"),)),
     ("frame loop, the rest", (("vslam.run.pipeline", "run_sequence"),)),
     ("results", (("vslam.report.folder", "write_results"),)),
 )

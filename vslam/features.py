@@ -112,11 +112,14 @@ class Extracted:
         row_offset: ``(N,)`` float32, row of the stereo match in the right image minus row of the
             feature in the left image, in pixels. NaN where it was not measured, or None if it was
             not measured for any feature.
+        disparity_offset: offset that has been added to every disparity, in pixels
+            (``vslam.frontend.rig.with_offset``).
     """
 
     features: Features
     pyramid: Pyramid | None = None
     row_offset: NDArray[np.float32] | None = None
+    disparity_offset: float = 0.0
 
     @classmethod
     def nothing(cls) -> Extracted:

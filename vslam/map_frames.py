@@ -6,14 +6,16 @@ The caller must ensure that no other thread writes the map while one of these fu
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.frame_poses import FrameTable
-from vslam.frontend.frame import Frame
-from vslam.geometry import compose, inverse, inverses, transform
+from vslam.frame_poses import FramePoses, FrameTable
+from vslam.frontend.rig import with_offset
+from vslam.frontend.track import Track
+from vslam.geometry import compose, inverse, inverses, orthonormalised, transform
 from vslam.hypotheses import joined_submaps
 from vslam.loops import LoopEdge
 from vslam.map import Map
@@ -24,6 +26,7 @@ from vslam.map_kernels import (
     refresh_landmarks,
     resolve,
 )
+from vslam.map_view import MapView
 from vslam.reprojection import stack_uvr
 from vslam.revisits import MAX_REVISITS, Revisits
 from vslam.starter import TwoViewStart
@@ -33,7 +36,7 @@ _STRETCH = 10  # keyframes of a stretch after which a place is old
 
 
 def add_frame(
-    map_: Map, frame: Frame, certainty: NDArray[np.uint8] | int, reference: int, *, predicted: bool
+    map_: Map, track: Track, certainty: NDArray[np.uint8] | int, reference: int, *, predicted: bool
 ) -> int:
     """Add a frame, with the landmarks that it tracks, to the map as a keyframe. Return its id.
 
@@ -45,10 +48,10 @@ def add_frame(
         predicted: if the keyframe begins a sub-map, whether its pose was predicted.
     """
     keyframe = map_.add_keyframe(
-        frame.refined_features(), frame.T_cw, frame.timestamp, frame.index, certainty
+        track.refined_features(), track.T_cw, track.timestamp, track.index, certainty
     )
-    tracked = np.flatnonzero(frame.landmark >= 0)
-    link_many(map_.arrays, map_.rows(keyframe).start + tracked, frame.landmark[tracked])
+    tracked = np.flatnonzero(track.landmark >= 0)
+    link_many(map_.arrays, map_.rows(keyframe).start + tracked, track.landmark[tracked])
     if keyframe > 0:
         neighbours, _ = map_.covisible(keyframe)
         if len(neighbours):
@@ -111,51 +114,83 @@ class LandmarkCounts:
             seen.clear()
 
 
-def drop_culled_landmarks(map_: Map, frames: Sequence[Frame]) -> None:
-    """Remove culled landmarks. Renumber the other landmarks in the map and in ``frames``."""
-    new_id = map_.drop_culled_landmarks()
-    for frame in {id(frame): frame for frame in frames}.values():
-        tracked = frame.landmark >= 0
-        frame.landmark = frame.landmark.copy()
-        frame.landmark[tracked] = new_id[frame.landmark[tracked]]
-
-
-def has_more_points(map_: Map, keyframe: int, frame: Frame) -> bool:
+def has_more_points(map_: Map, keyframe: int, track: Track) -> bool:
     """Return whether the far stereo points of a keyframe have not been mapped yet.
 
-    This is the case if the keyframe begins a map or sub-map, no keyframe follows it, and ``frame``
+    This is the case if the keyframe begins a map or sub-map, no keyframe follows it, and ``track``
     is the frame that became this keyframe.
     """
     begins = keyframe == 0 or keyframe in map_.restarts
-    return begins and keyframe == map_.n_keyframes - 1 and map_.frames[keyframe] == frame.index
+    return begins and keyframe == map_.n_keyframes - 1 and map_.frames[keyframe] == track.index
 
 
-def observe_keyframe(frame: Frame, map_: Map, keyframe: int) -> None:
-    """Make a frame that became a keyframe track all landmarks that this keyframe observes."""
-    frame.landmark = map_.arrays.landmark[map_.rows(keyframe)]
-    update_landmarks(frame, map_)
+def observe_keyframe(track: Track, map_: Map, keyframe: int) -> Track:
+    """Return a frame that became a keyframe with all landmarks that this keyframe observes."""
+    return with_landmarks(track, map_.arrays.landmark[map_.rows(keyframe)], map_)
 
 
-def update_landmarks(frame: Frame, map_: Map) -> None:
-    """Update the ids and positions of a frame's landmarks after the map has changed.
+def with_landmarks(track: Track, landmark: NDArray[np.int32], map_: Map) -> Track:
+    """Return a frame with the landmarks of its features, where they are in the map now.
 
-    The ids of culled landmarks become -1. If two tracked landmarks were merged, only the first of
-    the two features keeps the landmark.
+    The ids of culled landmarks become -1. If two landmarks were fused, only the first of the two
+    features keeps the landmark.
+
+    Args:
+        landmark: ``(N,)`` int32 id of the landmark of each feature, or -1.
     """
     arrays = map_.arrays
-    ids = resolve(arrays, frame.landmark)
+    ids = resolve(arrays, landmark)
     _, first = np.unique(ids, return_index=True)
     repeated = np.ones(len(ids), np.bool_)
     repeated[first] = False
     ids[repeated] = -1
-    frame.landmark = ids
-    frame.xyz = np.where((ids >= 0)[:, None], arrays.xyz[ids], np.nan)
+    xyz = np.where((ids >= 0)[:, None], arrays.xyz[ids], np.nan)
+    return replace(track, landmark=ids, xyz=xyz)
 
 
-def count_shared_landmarks(map_: Map, frame: Frame) -> NDArray[np.int64]:
+@dataclass(frozen=True)
+class MapChange:
+    """What publishing a result changed for the frames that tracking holds.
+
+    Apply it before the map is changed again.
+
+    Attributes:
+        before, after: what tracking saw of the map before and after the change.
+        map: the changed map.
+        frames: the recorded poses of all frames.
+    """
+
+    before: MapView
+    after: MapView
+    map: Map
+    frames: FramePoses
+
+    def applied_to(self, track: Track) -> Track:
+        """Return a frame after the change: its landmarks, disparities, pose and velocity.
+
+        A frame whose pose has been recorded moves with its own reference keyframe. Any other frame
+        moves with the current reference keyframe.
+        """
+        before, after = self.before, self.after
+        growth = after.unit_scale / before.unit_scale
+        if track.index < len(self.frames):
+            T_cw = self.frames.pose(track.index)
+        else:
+            T_c_reference = track.T_cw @ inverse(before.T_reference)
+            T_c_reference[:3, 3] *= growth
+            T_cw = orthonormalised(T_c_reference @ after.T_reference)
+        twist = track.twist
+        if twist is not None:
+            twist = np.concatenate([twist[:3] * growth, twist[3:]])
+        extracted = with_offset(track.extracted, after.disparity_offset)
+        moved = replace(track, T_cw=T_cw, twist=twist, extracted=extracted)
+        return with_landmarks(moved, track.landmark, self.map)
+
+
+def count_shared_landmarks(map_: Map, track: Track) -> NDArray[np.int64]:
     """Count the landmarks that each of ``(n_keyframes,)`` keyframes shares with a frame."""
     a, n = map_.arrays, map_.n_keyframes
-    _, rows = gather_observations(a, frame.landmark[frame.landmark >= 0], np.arange(n))
+    _, rows = gather_observations(a, track.tracked, np.arange(n))
     return np.bincount(a.keyframe[rows], minlength=n)
 
 
@@ -173,15 +208,15 @@ class OldPlace(NamedTuple):
     n_place: int
 
 
-def find_old_place(map_: Map, frame: Frame, known_after_s: float) -> OldPlace | None:
+def find_old_place(map_: Map, track: Track, known_after_s: float) -> OldPlace | None:
     """Find the old keyframe that shares the most landmarks with a frame.
 
     A keyframe is old if it was added at least ``known_after_s`` seconds ago or on an earlier drive.
     The result is None if no old keyframe shares a landmark with the frame.
     """
     young = map_.sessions == map_.scalars.session
-    young &= map_.timestamps > frame.timestamp - known_after_s
-    shared = np.where(young, 0, count_shared_landmarks(map_, frame))
+    young &= map_.timestamps > track.timestamp - known_after_s
+    shared = np.where(young, 0, count_shared_landmarks(map_, track))
     best = int(np.argmax(shared))
     if shared[best] == 0:
         return None
@@ -202,7 +237,7 @@ def sees_old_place(map_: Map, keyframe: int, min_shared: int) -> bool:
     return bool((np.diff(number) > _STRETCH).any())
 
 
-def add_revisit(map_: Map, keyframe: int, frame: Frame, certainty: NDArray[np.uint8] | int) -> bool:
+def add_revisit(map_: Map, keyframe: int, track: Track, certainty: NDArray[np.uint8] | int) -> bool:
     """Keep what a frame at a known place observes, unless there are enough revisits of this place.
 
     Args:
@@ -214,13 +249,13 @@ def add_revisit(map_: Map, keyframe: int, frame: Frame, certainty: NDArray[np.ui
     """
     if np.count_nonzero(map_.revisits.keyframe == keyframe) >= MAX_REVISITS:
         return False
-    features = frame.refined_features()
-    tracked = np.flatnonzero(frame.landmark >= 0)
+    features = track.refined_features()
+    tracked = np.flatnonzero(track.landmark >= 0)
     new = Revisits(
         np.array([keyframe]),
-        (frame.T_cw @ inverse(map_.keyframe_pose(keyframe)))[None],
+        (track.T_cw @ inverse(map_.keyframe_pose(keyframe)))[None],
         np.array([0, len(tracked)]),
-        frame.landmark[tracked],
+        track.landmark[tracked],
         stack_uvr(features.xy[tracked], features.u_right[tracked]).astype(np.float32),
         features.octave[tracked],
         np.broadcast_to(np.uint8(certainty), len(features))[tracked],

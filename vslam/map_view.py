@@ -90,6 +90,8 @@ class MapView:
             map has fewer than three keyframes, all of its keyframes must observe the landmark.
         patches: image patches of the local landmarks that the newest keyframes observe.
         with_patches: the landmarks that have patches, in the same order as in ``patches``.
+        disparity_offset: offset that is added to every measured disparity, in pixels.
+        offset_sigma: standard deviation of ``disparity_offset``, in pixels.
         part: index of the part of the map that contains the reference keyframe
             (``TrackResult.part``).
     """
@@ -103,6 +105,8 @@ class MapView:
     n_reference: int = 0
     patches: LandmarkPatches = NO_PATCHES
     with_patches: LocalMap = NO_LANDMARKS
+    disparity_offset: float = 0.0
+    offset_sigma: float = 0.0
     part: int = 0
 
 
@@ -130,4 +134,5 @@ def view_of(
         n_reference=count_seen_by(map_.arrays, keyframe, min(3, len(living))),
         patches=patches,
         with_patches=LocalMap._make(values[at] for values in local),
+        disparity_offset=map_.scalars.disparity_offset,
     )

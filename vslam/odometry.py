@@ -198,8 +198,8 @@ class Odometry:
         state: the pose of the last frame and its uncertainty.
     """
 
-    def __init__(self) -> None:
-        self.state = OdometryState()
+    def __init__(self, state: OdometryState | None = None) -> None:
+        self.state = OdometryState() if state is None else state
 
     def move(
         self,

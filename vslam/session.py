@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,17 +11,19 @@ from vslam.camera import same_camera
 from vslam.closing import LoopClosing
 from vslam.config import changed_thresholds
 from vslam.context import Context
-from vslam.features import TrackResult
+from vslam.features import Extracted
 from vslam.frame_poses import FrameTable
-from vslam.frontend.rig import RigCalibration
-from vslam.frontend.tracker import Tracker
+from vslam.frontend.orb import level_shapes
+from vslam.frontend.pose_alignment import coarse_pyramid, coarse_shapes
+from vslam.frontend.rig import RigMonitor
+from vslam.frontend.track import Track
 from vslam.geometry import inverse, orthonormalised, se3_log
 from vslam.map import Map
 from vslam.mapping import Mapper
 from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.modes import Mode
-from vslam.odometry import Odometry, OdometryState
-from vslam.states import Checkpoint
+from vslam.motion import Motion
+from vslam.states import Checkpoint, TrackerState
 
 _log = logging.getLogger(__name__)
 
@@ -99,21 +101,21 @@ class Session:
     context: Context
     closing: LoopClosing
     mapper: Mapper
-    tracker: Tracker
-    rig: RigCalibration
+    motion: Motion
+    rig: RigMonitor
     mode: Mode
-    odometry: Odometry
     opened: OpenedMap
 
-    def stored_map(self, drive: str) -> StoredMap:
+    def stored_map(self, drive: str, last: Track | None) -> StoredMap:
         """Return the map in the form in which it is stored in a file.
 
         It contains a checkpoint if ``state`` can return one. The arrays of the map are not copied.
 
         Args:
             drive: source of the images of the current drive, such as "kitti 06".
+            last: the last tracked frame.
         """
-        map_, images, opened = self.mapper.complete(), self.closing.verifier.images, self.opened
+        map_, images, opened = self.mapper.wait(), self.closing.verifier.images, self.opened
         return StoredMap(
             map=map_,
             camera=self.context.camera,
@@ -124,65 +126,65 @@ class Session:
             drives=(*opened.drives, drive) if self.mode.changes_map else opened.drives,
             thresholds=changed_thresholds(self.context.config.model_dump()),
             truth_alignment=opened.truth_alignment,
-            checkpoint=self.state(),
+            checkpoint=self.state(last),
         )
 
-    def state(self) -> Checkpoint | None:
+    def state(self, last: Track | None) -> Checkpoint | None:
         """Return the state of all parts between two frames, or None if this is not possible now.
 
         It is not possible before the first frame is tracked, or if the run only localises. It is
         also not possible while a keyframe is being mapped, a monocular map begins, a verified loop
         is waiting to be closed, or a global bundle adjustment is running.
         """
-        tracker, policy = self.tracker.state(), self.mode.state()
-        if tracker is None or policy is None:
+        policy, mapper = self.mode.state(), self.mapper
+        if last is None or policy is None:
             return None
-        mapper = self.mapper
-        if self.closing.is_adjusting or not mapper.is_merged or mapper.has_found_loop:
+        if self.closing.is_adjusting or not mapper.is_published or mapper.has_found_loop:
             return None
         return Checkpoint(
-            tracker,
-            self.mapper.state(),
+            tracker_state(last, self.motion.lost_frames),
+            mapper.state(),
             policy,
             self.closing.state(),
             self.rig.state(),
-            self.odometry.state,
+            self.motion.odometry.state,
         )
 
-    def restore(self, state: Checkpoint) -> None:
-        """Restore the state of all parts, given the map that was stored together with it."""
+    def restore(self, state: Checkpoint) -> Track:
+        """Restore the state of all parts, given the map that was stored together with it.
+
+        Returns:
+            The last tracked frame.
+        """
         self.mapper.restore(state.mapper)
         self.mode.restore(state.policy)
         self.closing.restore(state.closing)
         self.rig.restore(state.rig)
-        self.odometry.state = state.odometry
-        landmark = state.tracker.landmark
-        xyz = np.full((len(landmark), 3), np.nan)
-        xyz[landmark >= 0] = self.mapper.map.arrays.xyz[landmark[landmark >= 0]]
-        self.rig.mark_corrected(self.tracker.restore(state.tracker, xyz))
+        self.motion.restore(state.odometry, state.tracker.lost_frames)
+        last = restored_track(state.tracker, self.context)
+        offset = self.mapper.view.disparity_offset  # it was corrected before it was saved
+        extracted = replace(last.extracted, disparity_offset=offset)
+        positions = self.mapper.map.arrays.xyz[last.landmark]
+        xyz = np.where((last.landmark >= 0)[:, None], positions, np.nan)
+        return replace(last, extracted=extracted, xyz=xyz)
 
-    def resume_odometry(self, last: TrackResult) -> None:
-        """Continue the odometry of a resumed drive, unless a checkpoint has restored it."""
-        T_odom_camera, uncertainty = last.T_odom_camera, last.uncertainty
-        if T_odom_camera is None or uncertainty is None or self.opened.checkpoint is not None:
-            return
-        self.odometry.state = OdometryState(T_odom_camera, uncertainty, 0.0)
-
-    def resume(self) -> None:
+    def resume(self) -> Track | None:
         """If ``resume=True`` was passed to ``open_map``, continue the drive after its last frame.
 
         With a checkpoint, the results are identical to those of an uninterrupted run. Without a
         checkpoint, tracking continues from the last pose and speed.
+
+        Returns:
+            The last tracked frame. None if it is unknown.
         """
         frames = self.opened.frames
         if frames is None:
-            return
+            return None
         if len(frames.timestamp):
             self.mapper.continue_drive()
-            self.tracker.resume()
+            self.motion.resume()
         if self.opened.checkpoint is not None:
-            self.restore(self.opened.checkpoint)
-            return
+            return self.restore(self.opened.checkpoint)
         if self.mapper.n_keyframes:
             _log.warning(
                 "the map was saved without the state of tracking (resumable=True), so the poses of "
@@ -192,4 +194,41 @@ class Session:
             self.mapper.refer_to(int(frames.reference[-1]))
             poses = self.mapper.frames
             step = se3_log(orthonormalised(poses.pose(-1) @ inverse(poses.pose(-2))))
-            self.tracker.resume(step / (frames.timestamp[-1] - frames.timestamp[-2]))
+            self.motion.resume(step / (frames.timestamp[-1] - frames.timestamp[-2]))
+        return None
+
+
+def tracker_state(last: Track, lost_frames: int) -> TrackerState:
+    """Return the last tracked frame for a checkpoint."""
+    return TrackerState(
+        index=last.index,
+        timestamp=last.timestamp,
+        features=last.features,
+        landmark=last.landmark,
+        T_cw=last.T_cw,
+        twist=last.twist,
+        lost_frames=lost_frames,
+        n_tracked=last.n_inliers,
+        coarse=np.empty(0, np.uint8) if last.coarse is None else last.coarse.pixels,
+        standstill=last.still,
+    )
+
+
+def restored_track(state: TrackerState, context: Context) -> Track:
+    """Return the frame whose state ``tracker_state`` returned, without positions of landmarks."""
+    coarse = None
+    if len(state.coarse):
+        size = context.camera.height, context.camera.width
+        shapes = coarse_shapes(level_shapes(size, context.config.orb))
+        coarse = coarse_pyramid(state.coarse, shapes, size)
+    return Track(
+        state.index,
+        state.timestamp,
+        state.T_cw,
+        Extracted(state.features),
+        state.landmark,
+        n_inliers=state.n_tracked,
+        twist=state.twist,
+        still=state.standstill,
+        coarse=coarse,
+    )

@@ -18,14 +18,13 @@ from vslam.context import Context
 from vslam.errors import InputError
 from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.extraction import FrameImages
-from vslam.frontend.frame import Frame, PlacedFrame
 from vslam.frontend.masks import Mask
 from vslam.frontend.relocaliser import Relocaliser
-from vslam.frontend.rig import RigCalibration
-from vslam.frontend.tracker import Found, Tracker, TrackerStatus, result_of
-from vslam.frontend.tracking import uncertainty_of
+from vslam.frontend.rig import RigMonitor
+from vslam.frontend.track import By, GivenFeatures, Images, Prediction, Track
+from vslam.frontend.tracker import Tracker
 from vslam.gaps import Gap, find_gaps
-from vslam.geometry import Matrix, adjoint, inverse
+from vslam.geometry import inverse
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_verification import LearnedRelocalisation
 from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
@@ -38,8 +37,8 @@ from vslam.map_frames import in_first_part, keyframe_trajectory
 from vslam.mapping import Mapper
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
-from vslam.modes import MapBuilding, Mode
-from vslam.odometry import Odometry
+from vslam.modes import Building, Localising, Mode
+from vslam.motion import Motion
 from vslam.session import Session, open_map
 from vslam.trajectory import Trajectory
 from vslam.workers import Workers
@@ -116,21 +115,19 @@ class Slam:
             detector, images = detector_with_images(detector, config)
         self.context = context = Context.create(camera, config)
         self.detector = detector
-        self.rig = rig = RigCalibration(camera, config.stereo, context.scales)
+        self.rig = rig = RigMonitor(context)
         verifier = verifier_for(config, camera, images)
         self._closing = closing = LoopClosing(detector, verifier, camera, config, threads=threads)
         opened = open_map(start, context, closing, localize=localize, resume=resume)
         self.workers = workers = Workers(threads)
-        self._mapper = mapper = Mapper(context, closing, rig, workers, opened.map, opened.frames)
+        self._mapper = mapper = Mapper(context, closing, workers, opened.map, opened.frames)
+        self._motion = motion = Motion(context, mapper.frames)
         self._tracker = tracker = Tracker(context)
         recognise = LearnedRelocalisation(images, camera, config)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)
-        self._mode = Mode(mapper) if localize else MapBuilding(context, mapper, tracker)
-        self._odometry = Odometry()
-        self._session = Session(
-            context, closing, mapper, tracker, rig, self._mode, self._odometry, opened
-        )
-        self._session.resume()
+        self._mode: Mode = Localising(mapper) if localize else Building(context, mapper, tracker)
+        self._session = Session(context, closing, mapper, motion, rig, self._mode, opened)
+        self._last = self._session.resume()  # the last frame that was tracked
         self.next_extraction = -1
 
     @classmethod
@@ -195,7 +192,7 @@ class Slam:
         Raises:
             RuntimeError: mapping failed, so that the map is incomplete.
         """
-        return self._session.stored_map(drive)
+        return self._session.stored_map(drive, self._last)
 
     def step(
         self,
@@ -254,10 +251,7 @@ class Slam:
                 the result.
             on_pose: as in ``step``.
         """
-        frame = self._next_frame(Extracted.nothing(), timestamp, None)
-        frame.source, frame.pyramid, frame.coarse = images, images.pyramid, images.coarse
-        frame.mask = images.mask
-        return self._step(frame, StageClock(dict(stage_ms or {})), on_pose)
+        return self._step(images, timestamp, StageClock(dict(stage_ms or {})), on_pose)
 
     def step_features(
         self,
@@ -276,150 +270,113 @@ class Slam:
             stage_ms: wall time of the stages before this call, in milliseconds. It is included in
                 the result.
         """
-        frame = self._next_frame(extracted, timestamp, image)
-        return self._step(frame, StageClock(dict(stage_ms or {})))
+        images = GivenFeatures(extracted, image)
+        return self._step(images, timestamp, StageClock(dict(stage_ms or {})))
 
     def _step(
         self,
-        frame: Frame,
+        images: Images,
+        timestamp: float,
         clock: StageClock,
         on_pose: Callable[[TrackResult], None] = _ignore,
     ) -> TrackResult:
-        mapper, tracker = self._mapper, self._tracker
-        mapper.admit(frame, tracker.last, tracker.twist)
+        self._check(timestamp)
+        self._publish_due()
         clock.lap("wait_for_mapping")
-        if mapper.n_keyframes:
-            tracked, T_predicted = self._track(frame, clock)
-            last = tracker.last_seen(frame.timestamp, mapper.view)
-            found = self._relocaliser.relocalise_if_needed(frame, tracked, mapper, last)
-            if found is not tracked:
-                clock.lap("relocalise")
-            placed = self._record_pose(frame, found, T_predicted)
-            on_pose(self._result(frame, found, False, dict(clock.ms)))
-            is_keyframe = self._update_map(placed, found)
+        if self._mapper.n_keyframes:
+            track, predicted = self._track(images, timestamp, clock)
+            track = self._record(track, predicted)
+            on_pose(self._result(track, dict(clock.ms)))
+            by_patches = track.by_patches
+            track = self._mode.update_map(track, images, predicted)
+            # If patches failed for this frame, they will probably fail for the next frames.
+            self.next_extraction = self._mode.due if by_patches else track.index + 2
         else:
-            found = self._begin_map(frame, clock)
-            is_keyframe = not found.is_lost
-            on_pose(self._result(frame, found, is_keyframe, dict(clock.ms)))
-        if is_keyframe:
-            self._odometry.keyframe()
+            track = self._begin_map(images, timestamp, clock)
+            on_pose(self._result(track, dict(clock.ms)))
+        self._keep(track, images)
         clock.lap("keyframe")
-        return self._result(frame, found, is_keyframe, clock.ms)
+        return self._result(track, clock.ms)
 
-    def _result(
-        self, frame: Frame, found: Found, is_keyframe: bool, stage_ms: dict[str, float]
-    ) -> TrackResult:
-        camera, odometry = self.context.camera, self._odometry
-        result = result_of(frame, found, is_keyframe, stage_ms, odometry, camera)
-        return replace(result, part=self._mapper.view.part)
+    def _publish_due(self) -> None:
+        """Publish what is due at the next frame. The last frame moves with the map."""
+        mapper, last = self._mapper, () if self._last is None else (self._last,)
+        moved = mapper.publish(*last, frame=len(mapper.frames))
+        self._last = moved[0] if moved else None
 
-    def _begin_map(self, frame: Frame, clock: StageClock) -> Found:
-        self.rig.extract(frame, self._tracker.twist)
-        clock.lap("extract")
-        self._follow(frame, frame.T_cw, None)
-        begun = self._mode.begin(self._mapper.append_pose(frame, tracked=False))
-        return Found.at_start(frame, begun=begun)
-
-    def _track(self, frame: Frame, clock: StageClock) -> tuple[Found, Matrix]:
-        """Track a frame by patches or, if this fails, by features.
-
-        Returns:
-            The result, and the ``(4, 4)`` pose ``T_cw`` that was predicted with constant velocity.
-        """
+    def _track(
+        self, images: Images, timestamp: float, clock: StageClock
+    ) -> tuple[Track, Prediction]:
+        """Track the next frame from its predicted pose, and relocalise it if this fails."""
         mapper, tracker = self._mapper, self._tracker
-        T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
-        by_patches = tracker.track_patches(frame, T_predicted, mapper.view, mapper.frames)
-        state = tracker.judge_patches(by_patches)
-        clock.lap("track")
-        if state == TrackingState.OK:
-            return tracker.use_patches(frame, by_patches), T_predicted
-        before = frame.snapshot()
-        self.rig.extract(frame, tracker.twist)
+        predicted = self._motion.predict(timestamp, self._last, mapper.view)
+        track = tracker.track(images, predicted, mapper.view, clock)
+        if track.is_lost and (last := self._mode.map_far_points(self._last)) is not None:
+            predicted = self._motion.predict(timestamp, last, mapper.view)
+            track = tracker.track(images, predicted, mapper.view, clock)
+        seen = predicted.last_seen(mapper.view)
+        if track.is_doubtful and predicted.last is not None:
+            # It is worth waiting for the map: a doubtful frame soon becomes a keyframe.
+            track, last = mapper.publish(track, predicted.last)
+            predicted = replace(predicted, last=last)
+        if track.is_doubtful or (track.is_lost and mapper.is_published):
+            track = self._relocaliser.check(track, images, mapper.wait(), seen)
+            clock.lap("relocalise")
+        self._last = predicted.last
+        return track, predicted
+
+    def _record(self, track: Track, predicted: Prediction) -> Track:
+        """Record the pose of a frame, and return the frame with its velocity."""
+        track = self._motion.advance(track, predicted, self._mapper.view)
+        self._mapper.record(track)
+        self._last = predicted.last if track.is_lost else track
+        return track
+
+    def _begin_map(self, images: Images, timestamp: float, clock: StageClock) -> Track:
+        view = self._mapper.view
+        predicted = self._motion.predict(timestamp, self._last, view)
+        track = self._tracker.extract(images, predicted, view)
         clock.lap("extract")
-        tracked = tracker.track(frame, T_predicted, mapper.view, mapper.frames)
-        if tracked.is_lost and self._mode.map_far_points():
-            T_predicted = tracker.predict(frame.timestamp, mapper.frames, mapper.view)
-            tracked = tracker.track(frame, T_predicted, mapper.view, mapper.frames)
-        if tracked.is_lost and state == TrackingState.WEAK:
-            frame.restore(before)
-            tracked = tracker.use_patches(frame, by_patches)
-        clock.lap("track")
-        return tracked, T_predicted
+        track = self._mode.begin(self._record(track, predicted), images.image)
+        n = len(track.tracked)
+        state = TrackingState.OK if track.is_keyframe else TrackingState.LOST
+        return replace(track, state=state, n_matches=n, n_inliers=n)
 
-    def _record_pose(self, frame: Frame, found: Found, T_predicted: Matrix) -> PlacedFrame:
-        """Record the pose of a frame, or the predicted pose if it is lost. Advance the odometry."""
-        mapper, tracker = self._mapper, self._tracker
-        known = tracker.twist is not None
-        if found.is_lost:
-            frame.T_cw = T_predicted
-            self._follow(frame, T_predicted, None, known_velocity=known)
-            tracker.lose()
-            return mapper.append_pose(frame, tracked=False)
-        found_again = found.relocalised or tracker.status is not TrackerStatus.TRACKING
-        T_moved = T_predicted if found_again else frame.T_cw
-        tracker.accept(frame, found, mapper.frames, mapper.n_keyframes)
-        uncertainty = uncertainty_of(frame, self.rig.offset_sigma, self.context)
-        self._follow(frame, T_moved, *uncertainty, found_again=found_again, known_velocity=known)
-        return mapper.append_pose(frame, tracked=True, near=found.keyframe)
+    def _keep(self, track: Track, images: Images) -> None:
+        """End the step of a frame. The next frame is tracked from it, unless it is lost."""
+        if track.is_keyframe:
+            self._motion.keyframe()
+        if track.is_keyframe or not track.is_lost:
+            self._last = track
+        self.rig.observe(track, images)
 
-    def _update_map(self, frame: PlacedFrame, found: Found) -> bool:
-        """Update the map and ``next_extraction``. Return whether the frame became a keyframe."""
-        by_patches = frame.source is not None
-        if found.is_lost:
-            is_keyframe = self._mode.begin_after_loss(frame)
-        else:
-            is_keyframe = self._mode.update_map(frame, found)
-            self.rig.observe(frame, frame.twist)
-        # If patches failed for this frame, they will probably fail for the next frames.
-        self.next_extraction = self._mode.due if by_patches else frame.index + 2
-        return is_keyframe
+    def _result(self, track: Track, stage_ms: dict[str, float]) -> TrackResult:
+        odometry = self._motion.odometry.state
+        return TrackResult(
+            index=track.index,
+            timestamp=track.timestamp,
+            T_wc=self.context.camera.as_mounted(inverse(track.T_cw)),
+            state=track.state,
+            n_features=0 if track.by_patches else len(track.features),
+            n_stereo=track.n_stereo,
+            n_matches=track.n_matches,
+            n_inliers=track.n_inliers,
+            is_keyframe=track.is_keyframe,
+            relocalised=track.by is By.PLACE,
+            stage_ms=stage_ms,
+            T_odom_camera=odometry.T_odom_camera,
+            uncertainty=odometry.now,
+            part=self._mapper.view.part,
+            support=track.support,
+            stands_still=track.by is By.STANDSTILL,
+        )
 
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
         """Add a frame without images at the predicted pose. Its state is LOST or DROPPED."""
-        frame = self._next_frame(Extracted.nothing(), timestamp, None)
-        frame.T_cw = self._tracker.predict(timestamp, self._mapper.frames, self._mapper.view)
-        known = self._tracker.twist is not None
-        self._follow(frame, frame.T_cw, None, known_velocity=known)
-        self._mapper.append_pose(frame, tracked=False)
-        if self._mapper.n_keyframes and not dropped:
-            self._tracker.lose()
-        found = Found(TrackingState.DROPPED if dropped else TrackingState.LOST)
-        return self._result(frame, found, False, {})
-
-    def _follow(
-        self,
-        frame: Frame,
-        T_cw: Matrix,
-        covariance: Matrix | None,
-        of_offset: Matrix | None = None,
-        *,
-        found_again: bool = False,
-        known_velocity: bool = True,
-    ) -> None:
-        """Advance the odometry to the next frame, before the pose of this frame is recorded.
-
-        Args:
-            T_cw: ``(4, 4)`` pose of the frame, computed from the continuous motion since the last
-                frame. It differs from the pose of the frame in the map if the camera was
-                relocalised.
-            covariance, of_offset, found_again, known_velocity: see ``Odometry.move``.
-        """
-        frames = self._mapper.frames
-        T_now_last, elapsed = np.eye(4), 0.0
-        if len(frames):
-            T_now_last = T_cw @ inverse(frames.pose(-1))
-            elapsed = frame.timestamp - frames.timestamp(-1)
-        camera = self.context.camera
-        if camera.quarter_turns:  # the odometry is that of the camera as mounted
-            T = camera.T_mounted_camera
-            A, R = adjoint(T), T[:3, :3]
-            T_now_last = T @ T_now_last @ T.T
-            covariance = None if covariance is None else A @ covariance @ A.T
-            of_offset = None if of_offset is None else A @ of_offset @ R.T
-        self._odometry.move(
-            T_now_last, elapsed, covariance, of_offset,
-            found_again=found_again, known_velocity=known_velocity,
-        )  # fmt: skip
+        self._check(timestamp)
+        predicted = self._motion.predict(timestamp, self._last, self._mapper.view)
+        state = TrackingState.DROPPED if dropped else TrackingState.LOST
+        return self._result(self._record(replace(predicted.lost, state=state), predicted), {})
 
     def resume_odometry(self, last: TrackResult) -> None:
         """Continue ``T_odom_camera`` and its uncertainty after a drive was resumed.
@@ -430,19 +387,20 @@ class Slam:
         Args:
             last: the last result of the drive before it was resumed.
         """
-        self._session.resume_odometry(last)
+        if self._session.opened.checkpoint is None:
+            self._motion.resume_odometry(last)
 
     def finish(self) -> None:
         """Complete all mapping. The map and trajectory then do not change until the next step."""
-        self._mapper.finish()
+        moved = self._mapper.finish(*(() if self._last is None else (self._last,)))
+        self._last = moved[0] if moved else None
 
-    def _next_frame(self, extracted: Extracted, timestamp: float, image: Image | None) -> Frame:
+    def _check(self, timestamp: float) -> None:
         frames = self._mapper.frames
         if not math.isfinite(timestamp):
             raise ValueError(f"timestamp {timestamp} s must be a finite number")
         if len(frames) and not timestamp > (last := frames.timestamp(-1)):
             raise ValueError(f"timestamp {timestamp} s is not later than the last one, {last} s")
-        return Frame.of(extracted, self.context.camera, len(frames), timestamp, image)
 
     @property
     def map(self) -> Map:
@@ -454,9 +412,9 @@ class Slam:
         return self._mapper.map
 
     @property
-    def frame(self) -> Frame | None:
+    def frame(self) -> Track | None:
         """The last tracked frame, for visualisation. None before the first tracked frame."""
-        return self._tracker.last
+        return self._last
 
     @property
     def truth_alignment(self) -> TruthAlignment | None:
@@ -470,7 +428,7 @@ class Slam:
 
     @property
     def is_adjusting(self) -> bool:
-        """Whether a global bundle adjustment is running, or its result has not been merged yet."""
+        """Whether a global bundle adjustment is running, or its result has not been applied yet."""
         return self._closing.is_adjusting
 
     @property

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.two_views import adjust_two_views
+from vslam.camera import Image
 from vslam.context import Context
-from vslam.frontend.frame import Frame, PlacedFrame
 from vslam.frontend.initialization import match_views, reconstruct
+from vslam.frontend.track import Track
 from vslam.geometry import Matrix, se3_log
 
 
@@ -24,6 +25,7 @@ class TwoViewStart:
 
     Attributes:
         first, second: the two frames. The map begins at the pose of the first frame.
+        images: their ``(H, W)`` uint8 images for loop detectors. None if they are not available.
         T_2_1: ``(4, 4)``, maps points from the camera of the first frame to the camera of the
             second frame.
         features: two ``(N,)`` int64 arrays with the indices of the matched features in the first
@@ -34,8 +36,9 @@ class TwoViewStart:
             it was lost.
     """
 
-    first: Frame
-    second: PlacedFrame
+    first: Track
+    second: Track
+    images: tuple[Image | None, Image | None]
     T_2_1: Matrix
     features: tuple[NDArray[np.int64], NDArray[np.int64]]
     points: Matrix
@@ -67,22 +70,12 @@ class TwoViewStart:
         return replace(self, T_2_1=T_2_1, points=factor * self.points, predicted=True)
 
 
-@dataclass(frozen=True)
-class OneViewStart:
-    """The start of a map or sub-map from the stereo points of a single frame."""
-
-    frame: PlacedFrame
-
-
-Start = OneViewStart | TwoViewStart
-
-
 class Starter:
-    """Finds the frames with which a map or a sub-map can begin."""
+    """Finds the two frames with which a monocular map or sub-map can begin."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
-        self._first: Frame | None = None
+        self._first: tuple[Track, Image | None] | None = None
 
     @property
     def is_waiting(self) -> bool:
@@ -93,45 +86,43 @@ class Starter:
         """Discard the waiting first frame of a monocular map, if there is one."""
         self._first = None
 
-    def offer(self, frame: PlacedFrame) -> Start | None:
-        """Try to begin a map or sub-map with a frame that was not tracked.
-
-        Returns:
-            The frame or frames with which the map begins, or None if it cannot begin yet.
-        """
-        if self._context.camera.monocular:
-            return self._offer_monocular(frame)
-        enough = frame.n_stereo >= self._context.config.tracking.min_stereo_start
-        return OneViewStart(frame) if enough else None
-
-    def _offer_monocular(self, frame: PlacedFrame) -> TwoViewStart | None:
-        """Try to begin a monocular map with a frame and the earlier frame that was kept.
+    def offer(self, track: Track, image: Image | None) -> TwoViewStart | None:
+        """Try to begin a map with a frame that was not tracked and the earlier frame that was kept.
 
         If the two frames have too few matches or are too far apart in time, the new frame replaces
         the kept frame.
-        """
-        config = self._context.config.initialization
-        if self._first is None or frame.timestamp - self._first.timestamp > config.max_seconds:
-            self._keep(frame)
-            return None
-        features = match_views(self._first, frame, self._context)
-        if len(features[0]) < config.min_matches:
-            self._keep(frame)
-            return None
-        return self._pair(self._first, frame, features)
 
-    def _keep(self, frame: Frame) -> None:
-        enough = len(frame.features) >= self._context.config.initialization.min_features
+        Args:
+            image: the ``(H, W)`` uint8 image of the frame. None if it is not available.
+
+        Returns:
+            The two frames with which the map begins, or None if it cannot begin yet.
+        """
+        config, second = self._context.config.initialization, (track, image)
+        if self._first is None or track.timestamp - self._first[0].timestamp > config.max_seconds:
+            self._keep(second)
+            return None
+        features = match_views(self._first[0].features, track.features, self._context)
+        if len(features[0]) < config.min_matches:
+            self._keep(second)
+            return None
+        return self._pair(self._first, second, features)
+
+    def _keep(self, frame: tuple[Track, Image | None]) -> None:
+        enough = len(frame[0].features) >= self._context.config.initialization.min_features
         self._first = frame if enough else None
 
     def _pair(
-        self, first: Frame, second: PlacedFrame, features: tuple[NDArray, NDArray]
+        self,
+        first: tuple[Track, Image | None],
+        second: tuple[Track, Image | None],
+        features: tuple[NDArray, NDArray],
     ) -> TwoViewStart | None:
         config, camera = self._context.config.initialization, self._context.camera
-        of_1, of_2 = first.features, second.features
+        of_1, of_2 = first[0].features, second[0].features
         xy_1, xy_2 = of_1.xy[features[0]].astype(float), of_2.xy[features[1]].astype(float)
         sigma = self._context.scales[of_1.octave[features[0]]]
-        found = reconstruct(xy_1, xy_2, sigma, camera, config, seed=second.index)
+        found = reconstruct(xy_1, xy_2, sigma, camera, config, seed=second[0].index)
         if found is None:
             return None
         match = found.match
@@ -147,4 +138,5 @@ class Starter:
             return None
         match = match[kept]
         features = features[0][match], features[1][match]
-        return TwoViewStart(first, second, T_2_1, features, points[kept])
+        images = first[1], second[1]
+        return TwoViewStart(first[0], second[0], images, T_2_1, features, points[kept])

@@ -31,6 +31,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -54,13 +55,12 @@ from vslam.closing import LoopClosing
 from vslam.config import Config, DepthConfig, KeyframeConfig, MappingConfig, TrackingConfig
 from vslam.context import Context
 from vslam.datasets.png import unfilter
-from vslam.features import Extracted, Features
+from vslam.features import Extracted, Features, TrackingState
 from vslam.frontend import pnp
 from vslam.frontend.depth import columns_of_depth
-from vslam.frontend.frame import Frame
 from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
-from vslam.frontend.relocaliser import relocalise
-from vslam.frontend.rig import RigCalibration
+from vslam.frontend.relocaliser import relocalised
+from vslam.frontend.track import Track
 from vslam.loopclosure import bow, local_matching, sim3_ransac
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.detector import NoDetector
@@ -246,8 +246,7 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
     verifier = verifier_for(config, CAMERA)
     closing = LoopClosing(NoDetector(), verifier, CAMERA, config, threads=1)
     context = Context.create(CAMERA, config)
-    rig = RigCalibration(CAMERA, config.stereo, context.scales)
-    mapper = Mapper(context, closing, rig, Workers(1))
+    mapper = Mapper(context, closing, Workers(1))
     rng = np.random.default_rng(0)
     n = 400
     points = rng.uniform([-5.0, -4.0, 9.0], [9.0, 4.0, 12.0], (n, 3))
@@ -265,12 +264,11 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
             descriptors,
             uvr[:, 2].astype(np.float32),
         )
-        frame = Frame.of(Extracted(features), CAMERA, k, 0.1 * k)
-        frame.T_cw, frame.landmark = T_cw, landmark
-        mapper.hold(frame)
-        mapper.insert(mapper.append_pose(frame, tracked=True))
-        mapper.merge()
-        landmark = frame.landmark
+        seen = Track(k, 0.1 * k, T_cw, state=TrackingState.OK).with_features(Extracted(features))
+        track = replace(seen, landmark=landmark)
+        mapper.record(track)
+        (track,) = mapper.publish(mapper.insert(track, None))
+        landmark = track.landmark
     return mapper.map, features
 
 
@@ -282,7 +280,8 @@ def compile_recognition() -> None:
 
     place = local_map(map_, 0, 1)
     context = Context.create(CAMERA, config)
-    relocalise(Frame.of(Extracted(features), CAMERA), place, place, context, seed=0)
+    lost = Track(0, 0.0, np.eye(4)).with_features(Extracted(features))
+    relocalised(lost, place, place, context, seed=0)
 
     detector = BowDetector(smallest_vocabulary())
     detector.add(0, None, features)

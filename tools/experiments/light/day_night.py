@@ -28,15 +28,12 @@ from vslam.config import as_config
 from vslam.datasets import open_sequence
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.features import TrackingState
 from vslam.frontend.extraction import FrameImages
-from vslam.frontend.frame import Frame
 from vslam.frontend.relocaliser import Relocaliser
-from vslam.frontend.tracker import Found
+from vslam.frontend.track import Track
 from vslam.geometry import Matrix, inverse
 from vslam.loopclosure.learned_verification import LearnedRelocalisation
 from vslam.loopclosure.registry import detector_with_images
-from vslam.map import Map
 from vslam.slam import Slam
 
 WITHIN_M, WITHIN_DEG = 2.0, 15.0
@@ -56,17 +53,6 @@ class Day:
     path: Path
     T_wc: Matrix
     keyframes: frozenset[int]
-
-
-@dataclass(frozen=True)
-class WholeMap:
-    """Gives access to a map that does not change (an implementation of ``MapAccess``)."""
-
-    map: Map
-    is_merged: bool = True
-
-    def merge(self) -> Map:
-        return self.map
 
 
 def map_of(source: Source, n_frames: int, detector: str, path: Path) -> Day:
@@ -97,17 +83,16 @@ class Localiser:
         )
         places, images = detector_with_images(detector, config)
         slam = Slam.load(day.path, config, places, images=images, localize=True)
-        self._context, self._map = slam.context, WholeMap(slam.map)
+        self._context, self._map = slam.context, slam.map
         recognise = LearnedRelocalisation(images, slam.context.camera, config)
         self._relocaliser = Relocaliser(slam.context, places.locate, recognise)
 
     def pose(self, image: Image) -> Matrix | None:
         """Return the ``(4, 4)`` pose ``T_wc`` of an image; None if localisation fails."""
-        extracted = FrameImages(image, lambda: None, self._context).extracted
-        frame = Frame.of(extracted, self._context.camera, image=image)
-        lost = Found(TrackingState.LOST)
-        found = self._relocaliser.relocalise_if_needed(frame, lost, self._map)
-        return None if found.is_lost else inverse(frame.T_cw)
+        images = FrameImages(image, lambda: None, self._context)
+        lost = Track(0, 0.0, np.eye(4)).with_features(images.extracted)
+        found = self._relocaliser.check(lost, images, self._map, None)
+        return None if found.is_lost else inverse(found.T_cw)
 
 
 def is_right(T_wc: Matrix, k: int, day: Day, truth: Matrix) -> bool:

@@ -1,15 +1,15 @@
-"""A frame: the data from its images, and its pose."""
+"""A frame that is tracked: its features, its matches and its pose."""
 
 from __future__ import annotations
 
 import numpy as np
+from parts import frame_of
 
 from vslam.camera import Camera
 from vslam.config import Config
 from vslam.context import Context
-from vslam.features import Extracted, Features
-from vslam.frontend.frame import Frame
-from vslam.frontend.relocaliser import relocalise
+from vslam.features import Features
+from vslam.frontend.relocaliser import relocalised
 from vslam.frontend.tracking import refine
 from vslam.geometry import se3_exp, transform
 from vslam.map import Map
@@ -49,10 +49,21 @@ def place() -> LocalMap:
 
 
 def test_the_pose_of_a_frame_is_refined_from_a_nearby_one_and_found_by_relocalisation():
-    refined = Frame.of(Extracted(seen_from(T_CW)), CAMERA)
-    refined.landmark, refined.xyz = np.arange(N, dtype=np.int32), points()
-    assert refine(refined, se3_exp(np.full(6, 0.02)) @ T_CW, NO_LANDMARKS, CONTEXT) == N
-    found = Frame.of(Extracted(seen_from(T_CW)), CAMERA)
-    assert relocalise(found, place(), place(), CONTEXT, seed=0) > 0.8 * N
+    seen = frame_of(seen_from(T_CW))
+    matched = seen.matching(np.arange(N), np.arange(N, dtype=np.int32), points())
+    refined = refine(matched, se3_exp(np.full(6, 0.02)) @ T_CW, NO_LANDMARKS, CONTEXT)
+    found = relocalised(seen, place(), place(), CONTEXT, seed=0)
+    assert refined.n_inliers == N
+    assert found.n_inliers > 0.8 * N
     for frame in (refined, found):
         np.testing.assert_allclose(frame.T_cw, T_CW, atol=1e-4)
+
+
+def test_a_step_of_tracking_changes_nothing_that_it_was_given():
+    seen = frame_of(seen_from(T_CW))
+    matched = seen.matching(np.arange(N), np.arange(N, dtype=np.int32), points())
+    fewer = matched.without(np.arange(10))
+    assert len(seen.tracked) == 0
+    assert len(matched.tracked) == N
+    assert fewer.tracked.tolist() == list(range(10, N))
+    assert np.isnan(fewer.xyz[:10]).all()

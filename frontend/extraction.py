@@ -17,7 +17,6 @@ from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.masks import Mask
 from vslam.frontend.orb import Extraction, build_pyramid, extract_at
 from vslam.frontend.pose_alignment import coarse_levels
-from vslam.frontend.side_delay import row_offsets
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import StereoMatches, inliers_only, match_stereo
 from vslam.frontend.weak_images import extract_in_any_light
@@ -188,9 +187,7 @@ def matched(corners: Corners, context: Context, keypoints: Keypoints | None = No
     if matches is None:
         u_right = np.full(len(found.xy), np.nan, np.float32)
         return Extracted(_features(found, u_right), pyramid)
-    u_right = inliers_only(matches, found.octave)
-    rows = row_offsets(found, matches.right, u_right, config.stereo)
-    return Extracted(_features(found, u_right), pyramid, rows)
+    return Extracted(_features(found, inliers_only(matches, found.octave)), pyramid)
 
 
 def _features(found: Extraction, u_right: NDArray[np.float32]) -> Features:

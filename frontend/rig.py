@@ -1,9 +1,8 @@
 """Corrects the measurements of a stereo rig for errors that remain after rectification.
 
 The first error is a common offset of all disparities. It is estimated while the map grows
-(``backend/disparity_offset.py``). The second error is the delay of the right image. The calibration
-file gives this delay (``Camera.right_delay``). The delay is also measured, but the measured value
-is only reported.
+(``backend/disparity_offset.py``). The second error is the delay of the right image, which the
+calibration file gives (``Camera.right_delay``).
 """
 
 from __future__ import annotations
@@ -11,14 +10,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from vslam.camera import Camera
-from vslam.context import Context
 from vslam.features import Extracted, shifted_columns
-from vslam.frontend.side_delay import DelayState, SideDelay
 from vslam.frontend.sides import with_pair
 from vslam.frontend.track import Images, Track
 from vslam.geometry import Matrix
 from vslam.image_motion import columns_without_delay
-from vslam.states import ComparedSides, RigState
+from vslam.states import ComparedSides
 
 
 def corrected(
@@ -53,19 +50,16 @@ def with_offset(extracted: Extracted, offset: float) -> Extracted:
 
 
 class RigMonitor:
-    """Watches a stereo rig: the delay, the exposure and the failures of its right camera.
+    """Watches a stereo rig: the exposure and the failures of its right camera.
 
     Attributes:
-        delay: the measured delay of the right image.
         sides: a summary of how the exposures of the left and the right images differed.
         problems: one message for each frame whose right image could not be read.
     """
 
-    def __init__(self, context: Context) -> None:
-        self.delay = SideDelay(context.camera, context.config.stereo)
+    def __init__(self) -> None:
         self.sides = ComparedSides()
         self.problems: list[str] = []
-        self._scales = context.scales
 
     def observe(self, track: Track, images: Images) -> None:
         """Record what a frame and its images tell about the rig."""
@@ -75,19 +69,3 @@ class RigMonitor:
             self.problems.append(
                 f"Frame {track.index} has only its left image: {images.problem.rstrip('.')}."
             )
-        if not track.is_lost:
-            extracted = track.extracted
-            self.delay.add(extracted.features, extracted.row_offset, track.twist, self._scales)
-
-    def state(self) -> RigState:
-        """Return the measurements so far, for a map file or a checkpoint."""
-        return RigState(self.delay.state().numbers(), self.sides)
-
-    def restore(self, state: RigState) -> None:
-        """Restore the measurements that ``state`` returned.
-
-        Raises:
-            ValueError: the stored state is damaged.
-        """
-        self.delay.restore(DelayState.of_numbers(state.delay))
-        self.sides = state.sides

@@ -109,16 +109,12 @@ class Extracted:
         features: the N features that were extracted from the left image.
         pyramid: the pyramid of this image. None if matches in this image are not refined to
             sub-pixel accuracy.
-        row_offset: ``(N,)`` float32, row of the stereo match in the right image minus row of the
-            feature in the left image, in pixels. NaN where it was not measured, or None if it was
-            not measured for any feature.
         disparity_offset: offset that has been added to every disparity, in pixels
             (``vslam.frontend.rig.with_offset``).
     """
 
     features: Features
     pyramid: Pyramid | None = None
-    row_offset: NDArray[np.float32] | None = None
     disparity_offset: float = 0.0
 
     @classmethod

@@ -26,17 +26,6 @@ def rays(
     return (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
 
 
-def row_speeds(
-    x: NDArray[np.float64], y: NDArray[np.float64], inverse_depth: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return ``(N, 6)`` derivatives of row velocities by the twist, in focal lengths.
-
-    The row velocity of a point is the same in both images.
-    """
-    zero = np.zeros_like(x)
-    return np.column_stack([zero, inverse_depth, -y * inverse_depth, -1.0 - y * y, x * y, x])
-
-
 def column_speeds(
     x: NDArray[np.float64],
     y: NDArray[np.float64],

@@ -146,7 +146,7 @@ class Session:
             mapper.state(),
             policy,
             self.closing.state(),
-            self.rig.state(),
+            self.rig.sides,
             self.motion.odometry.state,
         )
 
@@ -159,7 +159,7 @@ class Session:
         self.mapper.restore(state.mapper)
         self.mode.restore(state.policy)
         self.closing.restore(state.closing)
-        self.rig.restore(state.rig)
+        self.rig.sides = state.sides
         self.motion.restore(state.odometry, state.tracker.lost_frames)
         last = restored_track(state.tracker, self.context)
         offset = self.mapper.view.disparity_offset  # it was corrected before it was saved

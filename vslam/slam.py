@@ -65,7 +65,7 @@ class Slam:
     Attributes:
         context: camera, thresholds and pyramid scales, for ``FrameImages``.
         detector: proposes loop candidates, and places for relocalisation.
-        rig: measurements of the stereo pair, such as the delay of the right camera.
+        rig: measurements of the stereo pair, such as the exposures of its images.
         workers: threads that run the mapping jobs. They can also prepare frames in advance.
         next_extraction: index of a later frame whose features will probably be needed.
             ``FrameImages.start_corners`` may be called in advance for this frame. -1 if there is no
@@ -115,7 +115,7 @@ class Slam:
             detector, images = detector_with_images(detector, config)
         self.context = context = Context.create(camera, config)
         self.detector = detector
-        self.rig = rig = RigMonitor(context)
+        self.rig = rig = RigMonitor()
         verifier = verifier_for(config, camera, images)
         self._closing = closing = LoopClosing(detector, verifier, camera, config, threads=threads)
         opened = open_map(start, context, closing, localize=localize, resume=resume)

@@ -188,19 +188,6 @@ class ComparedSides:
 
 
 @dataclass(frozen=True)
-class RigState:
-    """Measurements of a stereo rig.
-
-    Attributes:
-        delay: state of the estimator of the delay between the two cameras (``DelayState``).
-        sides: results of comparing the left and right images.
-    """
-
-    delay: tuple[float, ...] = ()
-    sides: ComparedSides = field(default_factory=ComparedSides)
-
-
-@dataclass(frozen=True)
 class Checkpoint:
     """The states of all parts of SLAM between two frames."""
 
@@ -208,5 +195,5 @@ class Checkpoint:
     mapper: MapperState
     policy: PolicyState
     closing: ClosingState
-    rig: RigState = field(default_factory=RigState)
+    sides: ComparedSides = field(default_factory=ComparedSides)
     odometry: OdometryState = field(default_factory=OdometryState)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, Image, calibration_doubts, field_of_view
+from vslam.config import StereoConfig
 from vslam.datasets.times import (
     GAP,
     JITTER,
@@ -27,6 +28,7 @@ from vslam.doctor.focal_length import FocalFit
 from vslam.errors import counted
 from vslam.run.matching import Matches, count_views
 from vslam.run.pair import ROWS_PX, find_lag, judge_sides, row_error
+from vslam.run.side_delay import SideDelay
 
 Times = NDArray[np.float64]
 Depth = NDArray[Any]  # any type of number; 0 or NaN means that the depth is missing
@@ -199,6 +201,15 @@ def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, in
         "timestamps of one camera",
     )
     return finding, best
+
+
+def check_delay(found: SideDelay | None, camera: Camera, config: StereoConfig) -> Finding:
+    """Check whether the right image has the delay that the calibration gives."""
+    if found is None:
+        return Finding("delay", "unknown", "too few frames with matches that move")
+    sigma = f"(standard deviation {1e3 * found.sigma:.1f} ms)"
+    wrong = found.is_wrong(camera, config)
+    return judge("delay", wrong, f"{found.description()} {sigma}", found.remedy())
 
 
 def check_features(counts: Sequence[int], requested: int) -> Finding:

@@ -27,6 +27,7 @@ from vslam.report.page import Figure, Page, Section
 from vslam.report.render import html
 from vslam.run.matching import Matches, joined, match_images
 from vslam.run.pair import ROWS_PX, row_error
+from vslam.run.side_delay import measure_delay
 
 _FRAMES = 8  # number of examined frames, which are spread over the sequence
 _LAGS = range(-2, 3)  # delays of the right image that are tried, in frames
@@ -101,7 +102,7 @@ def examine(sequence: Source, config: Config) -> Diagnosis:
         return Diagnosis([*findings, checks.check_scale(sequence.camera, None)], hidden)
     if seconds[0].dtype == np.uint8:
         few_features = any(f.check == "features" and f.verdict == "fault" for f in findings)
-        found, pictures = _examine_stereo(sequence, lefts, few_features=few_features)
+        found, pictures = _examine_stereo(sequence, lefts, config, few_features=few_features)
     else:
         found = [*checks.check_depth(images, seconds), checks.check_scale(sequence.camera, None)]
         found += _examine_focal_length(sequence, found)
@@ -171,7 +172,7 @@ def _pairs_with_lag(sequence: Source, lefts: dict[int, Image], lag: int) -> list
 
 
 def _examine_stereo(
-    sequence: Source, lefts: dict[int, Image], *, few_features: bool
+    sequence: Source, lefts: dict[int, Image], config: Config, *, few_features: bool
 ) -> tuple[list[Finding], list[Picture]]:
     inner = dict(list(lefts.items())[1:-1:2])  # frames that have frames before and after them
     by_lag = {lag: _pairs_with_lag(sequence, inner if lag else lefts, lag) for lag in _LAGS}
@@ -195,6 +196,9 @@ def _examine_stereo(
             [(pair.left, pair.right) for pair in pairs], [pair.matches for pair in pairs]
         ),
     ]
+    if synchronised.verdict == "good":
+        delay = measure_delay(sequence.stored)
+        findings.insert(1, checks.check_delay(delay, sequence.camera, config.stereo))
     findings += _examine_focal_length(sequence, findings)
     shown = sorted(pairs, key=lambda pair: -len(pair.matches))[:_PICTURES]
     return findings, [_stereo_picture(pair) for pair in shown]

@@ -13,7 +13,7 @@ from vslam.map import Map
 from vslam.maps.codec import Codec
 from vslam.states import Checkpoint, MapperState, TrackerState
 
-SCHEMA = 2
+SCHEMA = 3
 _MOST = 1e12  # metres, pixels or seconds
 LOOP_SHAPES = {
     "LoopEdge.T_query_match": (4, 4),

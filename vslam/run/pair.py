@@ -1,4 +1,4 @@
-"""Checks on the first frames of a run whether left and right images are a stereo pair.
+"""Checks whether left and right images are a stereo pair, mostly on the first frames of a run.
 
 ``vslam doctor`` uses the same criteria.
 """
@@ -17,10 +17,13 @@ import cv2
 import numpy as np
 
 from vslam.camera import Camera, Image
-from vslam.datasets.frames import TimedFrame
+from vslam.datasets.frames import Source, TimedFrame, first_frames
+from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.errors import InputError, UnreadableImageError, counted
+from vslam.plugins import reason
 from vslam.run.matching import Described, Matches, describe, match_described
 from vslam.run.options import RunOptions
+from vslam.run.side_delay import FEWEST_FRAMES, delay_warnings, measure_delay
 
 ROWS_PX = 0.8
 """Largest median vertical error of stereo matches. A run searches for stereo matches within 2 rows.
@@ -123,14 +126,29 @@ class PairCheck:
     """
 
     def __init__(self, camera: Camera, dataset: str, options: RunOptions) -> None:
+        self._camera, self._config = camera, options.thresholds.stereo
         self._open = camera.sensor == "stereo"
         self._fix_sides = how_to_swap(dataset, options)
         self._n_judged = 0
         self._found: dict[str, list[str]] = {}
+        self._late: list[str] = []
 
     def warnings(self) -> list[str]:
         """Return a sentence about a fault that was found, with a remedy."""
-        return [said[-1] for said in self._found.values() if len(said) == _AGREEING]
+        return [said[-1] for said in self._found.values() if len(said) == _AGREEING] + self._late
+
+    def end(self, source: Source, perturbation: Perturbation, n_frames: int) -> None:
+        """Measure the delay of the right image in the ``n_frames`` frames of the run, unless there
+        is another fault. The frames of a live camera cannot be read again."""
+        if self._camera.sensor != "stereo" or source.live or self.warnings():
+            return
+        try:
+            if n_frames >= FEWEST_FRAMES:
+                frames = perturbed(first_frames(source).frames(), perturbation)
+                found = measure_delay(list(islice(frames, n_frames)))
+                self._late = delay_warnings(found, self._camera, self._config)
+        except Exception as error:  # a failed check must not end the run
+            self._late = [f"The delay of the right image could not be measured ({reason(error)})."]
 
     def watch(self, frames: Iterator[TimedFrame]) -> Iterator[TimedFrame]:
         """Yield all frames. For a check, some frames are read in advance.

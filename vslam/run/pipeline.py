@@ -39,9 +39,8 @@ from vslam.run.progress import Progress, TrackLog, in_frames
 from vslam.run.recorder import Recorder
 from vslam.run.rig import (
     calibration_warnings,
-    delay_warnings,
-    measure_rig,
-    residual_warnings,
+    measure_offset,
+    offset_warnings,
     rig_warnings,
 )
 from vslam.slam import Slam
@@ -138,6 +137,7 @@ def run_sequence(
         with main.recording_failure("saving the map"):
             autosave.close(slam, main.so_far, resumable=bool(end_reasons) and main.has_map)
     seconds = main.seconds()
+    pair.end(sequence, perturbation, len(main.tracks))
     give_back_memory()  # the results are written from a copy of the map, which needs memory
     with main.recording_failure("the final trajectory"):
         if main.has_map:
@@ -387,8 +387,7 @@ def _count_left_out(source: Source) -> int:
 
 def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
     try:
-        residuals = measure_rig(slam.map, camera)
-        return delay_warnings(slam.rig.delay, camera) or residual_warnings(residuals, camera)
+        return offset_warnings(measure_offset(slam.map, camera), camera)
     except Exception as error:  # a failed check must not end the run
         return [f"The rig could not be checked ({reason(error)})."]
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, calibration_doubts
-from vslam.frontend.side_delay import SideDelay
 from vslam.geometry import compose, inverse, orthonormalised, se3_log
 from vslam.map import Map
 from vslam.states import ComparedSides
@@ -32,25 +30,11 @@ _LONGEST_GAP_S = 2.0  # between keyframes; the motion over a longer time is not 
 _SUSPECT_DELAY_S, _SUSPECT_OFFSET_PX = 0.4e-3, 0.2
 
 
-@dataclass(frozen=True)
-class RigResiduals:
-    """Systematic errors in the columns of features in right images, estimated from the final map.
+def measure_offset(map_: Map, camera: Camera) -> float | None:
+    """Estimate the constant error in all disparities of a map, in pixels.
 
-    Attributes:
-        delay_s: apparent delay of the right image relative to the left image, in seconds. It causes
-            residuals that are proportional to the speed of a feature in the image. The value is NaN
-            if the camera hardly moved.
-        offset_px: constant error in all disparities, in pixels.
-    """
-
-    delay_s: float
-    offset_px: float
-
-
-def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
-    """Estimate the delay of the right image and the offset of the disparities from a map.
-
-    The result is None if there are too few observations, or if the camera is not a stereo camera.
+    The result is None if there are too few observations, if the camera is not a stereo camera, or
+    if a delay of the right image distorts the disparities.
     """
     if camera.sensor != "stereo" or map_.n_keyframes < 3:
         return None
@@ -74,8 +58,8 @@ def measure_rig(map_: Map, camera: Camera) -> RigResiduals | None:
     if good.sum() < _FEWEST_OBSERVATIONS:
         return None
     delay, offset, _ = fit(residual[good], speed[good], disparity[good])
-    still = speed[good].std() < _LEAST_IMAGE_SPEED
-    return RigResiduals(float("nan") if still else delay, offset)
+    moves = speed[good].std() >= _LEAST_IMAGE_SPEED
+    return None if moves and abs(delay) > _SUSPECT_DELAY_S else offset
 
 
 def fit(
@@ -131,41 +115,16 @@ def calibration_warnings(camera: Camera, calib: Sequence[Path], name: str) -> li
     return [f"{source}: {doubt}." for doubt in calibration_doubts(camera)]
 
 
-def delay_warnings(delay: SideDelay, camera: Camera) -> list[str]:
-    """Return a warning if the measured delay of the right camera is not the calibrated delay."""
-    if not delay.is_wrong:
+def offset_warnings(offset_px: float | None, camera: Camera) -> list[str]:
+    """Return a warning if there is a constant error in the disparities."""
+    if offset_px is None or abs(offset_px) <= _SUSPECT_OFFSET_PX:
         return []
-    known = camera.right_delay
-    side = "right" if delay.seconds > 0 else "left"
-    instead = f" instead of {1e3 * known:.1f} ms (right_delay)" if known else ""
+    minutes = 60.0 * np.degrees(abs(offset_px) / camera.fx)
     return [
-        f"The cameras are not synchronised: the rows of stereo matches show that the {side} "
-        f"camera is {1e3 * abs(delay.seconds):.1f} ms late{instead}. Trigger both by one signal, "
-        f"or write right_delay: {delay.seconds:.4f} (seconds) into the file that --calib names "
-        "and run again; see docs/howto/cameras.md."
+        f"All disparities are off by {abs(offset_px):.2f} pixels: the cameras are "
+        f"rotated relative to their calibration by at least {minutes:.1f} arc minutes. "
+        "Calibrate the rig again."
     ]
-
-
-def residual_warnings(found: RigResiduals | None, camera: Camera) -> list[str]:
-    """Return a warning if stereo residuals show a delay or a constant error in the disparities."""
-    if found is None:
-        return []
-    warnings = []
-    if abs(found.delay_s) > _SUSPECT_DELAY_S:
-        side = "right" if found.delay_s > 0 else "left"
-        warnings.append(
-            f"The cameras seem not to be synchronised: the {side} camera is at least "
-            f"{1e3 * abs(found.delay_s):.1f} ms late, and usually much more, because bundle "
-            "adjustment absorbs most of a delay. Trigger both by one signal."
-        )
-    elif abs(found.offset_px) > _SUSPECT_OFFSET_PX:
-        minutes = 60.0 * np.degrees(abs(found.offset_px) / camera.fx)
-        warnings.append(
-            f"All disparities are off by {abs(found.offset_px):.2f} pixels: the cameras are "
-            f"rotated relative to their calibration by at least {minutes:.1f} arc minutes. "
-            "Calibrate the rig again."
-        )
-    return warnings
 
 
 def rig_warnings(sides: ComparedSides) -> list[str]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import DepthImage, Image, ImageMap
+from vslam.camera import DepthImage, Image, ImageMap, check_images, check_mask
 from vslam.context import Context
 from vslam.errors import UnreadableImageError
 from vslam.features import Extracted, Features, Keypoints, Pyramid
@@ -122,6 +122,28 @@ class FrameImages:
             problem = str(error)
         found = find_corners(self.left, second, self._context, image_map, self.mask, self.pyramid)
         return found._replace(problem=problem)
+
+
+def checked_images(
+    left: Image,
+    second: Image | DepthImage | None,
+    mask: NDArray[np.uint8] | NDArray[np.bool_] | None,
+    context: Context,
+) -> FrameImages:
+    """Copy the left image of a frame. The second image is not copied.
+
+    Args:
+        left, second, mask: see ``Slam.step``.
+
+    Raises:
+        ValueError: the images or the mask have the wrong size or type.
+    """
+    check_images(left, second, context.camera)
+    of_left = None
+    if mask is not None:
+        check_mask(mask, context.camera)
+        of_left = Mask.of(mask, context.config.orb)
+    return FrameImages(np.array(left), lambda: second, context, mask=of_left)
 
 
 def find_corners(

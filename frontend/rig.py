@@ -57,8 +57,8 @@ class RigMonitor:
         problems: one message for each frame whose right image could not be read.
     """
 
-    def __init__(self) -> None:
-        self.sides = ComparedSides()
+    def __init__(self, sides: ComparedSides | None = None) -> None:
+        self.sides = ComparedSides() if sides is None else sides
         self.problems: list[str] = []
 
     def observe(self, track: Track, images: Images) -> None:

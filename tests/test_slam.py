@@ -206,7 +206,7 @@ def test_the_pose_is_known_before_a_frame_becomes_a_keyframe(corridor):
     known = []
 
     def note(result):
-        known.append((result, slam._mapper.n_keyframes))
+        known.append((result, slam._session.mapper.n_keyframes))
 
     results = [
         slam.step(left, right, timestamp, on_pose=note)

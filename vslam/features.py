@@ -300,6 +300,8 @@ class TrackResult:
             a frame that was not tracked by patches, and if hardly any landmark is known to be at
             rest, as at the start of a map.
         stands_still: whether the camera stands still.
+        next_extraction: index of a later frame whose features will probably be needed, so that they
+            can be extracted in advance. -1 if there is no such frame.
     """
 
     index: int
@@ -318,6 +320,7 @@ class TrackResult:
     part: int = 0
     support: float | None = None
     stands_still: bool = False
+    next_extraction: int = -1
 
     @property
     def measured(self) -> bool:

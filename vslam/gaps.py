@@ -6,12 +6,14 @@ loop joins the sub-map to the rest of the map, nothing has confirmed this predic
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 
+from vslam.context import Context
 from vslam.frame_poses import FramePoses
 from vslam.geometry import inverse, orthonormalised
 from vslam.hypotheses import joined_submaps
@@ -64,7 +66,7 @@ class Gap:
 
 
 def find_gaps(
-    map_: Map, closed: Sequence[LoopEdge], frames: FramePoses, scale: float = 1.0
+    map_: Map, closed: Sequence[LoopEdge], frames: FramePoses, context: Context
 ) -> list[Gap]:
     """Find the gaps of the current drive that no closed loop has bridged, in the order of frames.
 
@@ -74,8 +76,8 @@ def find_gaps(
 
     Args:
         frames: poses of the frames of the drive.
-        scale: ``Gap.scale`` of a sub-map.
     """
+    scale = math.exp(context.config.pose_graph.gap_scale) if context.camera.monocular else 1.0
     table = frames.table()
     tracked, times = np.flatnonzero(table.tracked), table.timestamp
     if not len(tracked) or not map_.n_keyframes:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.frame_poses import FramePoses, FrameTable
+from vslam.frame_poses import FramePoses
 from vslam.frontend.rig import with_offset
 from vslam.frontend.track import Track
 from vslam.geometry import compose, inverse, inverses, orthonormalised, transform
@@ -271,12 +271,13 @@ def keyframe_trajectory(map_: Map) -> Trajectory:
     return Trajectory(map_.timestamps[living], inverses(map_.arrays.T_cw[living]))
 
 
-def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FrameTable) -> NDArray[np.bool_]:
+def in_first_part(map_: Map, closed: Sequence[LoopEdge], frames: FramePoses) -> NDArray[np.bool_]:
     """Return an ``(N,)`` bool array, True for frames that were tracked in the first sub-map.
 
     If a closed loop has joined another sub-map to the first one, its frames count as well.
     """
+    table = frames.table()
     if not map_.n_keyframes:
-        return frames.tracked
+        return table.tracked
     part = joined_submaps(map_, closed)
-    return frames.tracked & (part[frames.reference] == part[0])
+    return table.tracked & (part[table.reference] == part[0])

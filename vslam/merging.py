@@ -113,7 +113,7 @@ def join(
     # With threads=1, global bundle adjustment runs only in finish(), after the last loop.
     verifier = verifier_for(config, one.camera, images)
     closing = LoopClosing(detector, verifier, one.camera, config, threads=1)
-    closing.closed = list(both.loops)
+    closing.closed.extend(both.loops)
     map_, n = both.map, one.map.n_keyframes
     for keyframe in range(n, map_.n_keyframes):
         candidates = _candidates(map_, keyframe, detector, images, config)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,41 +10,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, DepthImage, Image, check_images, check_mask
-from vslam.closing import LoopClosing
+from vslam.camera import Camera, DepthImage, Image
 from vslam.config import Config, as_config
 from vslam.context import Context
 from vslam.errors import InputError
-from vslam.features import Extracted, TrackingState, TrackResult
-from vslam.frontend.extraction import FrameImages
-from vslam.frontend.masks import Mask
-from vslam.frontend.relocaliser import Relocaliser
-from vslam.frontend.rig import RigMonitor
-from vslam.frontend.track import By, GivenFeatures, Images, Prediction, Track
-from vslam.frontend.tracker import Tracker
+from vslam.features import Extracted, TrackResult
+from vslam.frontend.extraction import FrameImages, checked_images
+from vslam.frontend.track import GivenFeatures, Track
 from vslam.gaps import Gap, find_gaps
-from vslam.geometry import inverse
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loopclosure.learned_verification import LearnedRelocalisation
 from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.loopclosure.verifier import verifier_for
 from vslam.loops import LoopCorrection, LoopEdge
-from vslam.machine import StageClock
 from vslam.map import Map
 from vslam.map_frames import in_first_part, keyframe_trajectory
-from vslam.mapping import Mapper
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
-from vslam.modes import Building, Localising, Mode
-from vslam.motion import Motion
-from vslam.session import Session, open_map
+from vslam.session import Session
 from vslam.trajectory import Trajectory
 from vslam.workers import Workers
 
 
 def _ignore(result: TrackResult) -> None:
     """The default of ``on_pose``."""
+
+
+def _as_mounted(trajectory: Trajectory, camera: Camera) -> Trajectory:
+    return replace(trajectory, T_wc=camera.as_mounted(trajectory.T_wc))
 
 
 class Slam:
@@ -67,9 +58,6 @@ class Slam:
         detector: proposes loop candidates, and places for relocalisation.
         rig: measurements of the stereo pair, such as the exposures of its images.
         workers: threads that run the mapping jobs. They can also prepare frames in advance.
-        next_extraction: index of a later frame whose features will probably be needed.
-            ``FrameImages.start_corners`` may be called in advance for this frame. -1 if there is no
-            such frame.
     """
 
     def __init__(
@@ -115,20 +103,11 @@ class Slam:
             detector, images = detector_with_images(detector, config)
         self.context = context = Context.create(camera, config)
         self.detector = detector
-        self.rig = rig = RigMonitor()
-        verifier = verifier_for(config, camera, images)
-        self._closing = closing = LoopClosing(detector, verifier, camera, config, threads=threads)
-        opened = open_map(start, context, closing, localize=localize, resume=resume)
-        self.workers = workers = Workers(threads)
-        self._mapper = mapper = Mapper(context, closing, workers, opened.map, opened.frames)
-        self._motion = motion = Motion(context, mapper.frames)
-        self._tracker = tracker = Tracker(context)
-        recognise = LearnedRelocalisation(images, camera, config)
-        self._relocaliser = Relocaliser(context, detector.locate, recognise)
-        self._mode: Mode = Localising(mapper) if localize else Building(context, mapper, tracker)
-        self._session = Session(context, closing, mapper, motion, rig, self._mode, opened)
-        self._last = self._session.resume()  # the last frame that was tracked
-        self.next_extraction = -1
+        self.workers = Workers(threads)
+        self._session = Session(
+            context, detector, images, self.workers, start, localize=localize, resume=resume
+        )
+        self.rig = self._session.rig
 
     @classmethod
     def load(
@@ -192,7 +171,7 @@ class Slam:
         Raises:
             RuntimeError: mapping failed, so that the map is incomplete.
         """
-        return self._session.stored_map(drive, self._last)
+        return self._session.stored_map(drive)
 
     def step(
         self,
@@ -227,12 +206,7 @@ class Slam:
                 not later than the last timestamp.
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
-        check_images(left, second, self.context.camera)
-        of_left = None
-        if mask is not None:
-            check_mask(mask, self.context.camera)
-            of_left = Mask.of(mask, self.context.config.orb)
-        images = FrameImages(np.array(left), lambda: second, self.context, mask=of_left)
+        images = checked_images(left, second, mask, self.context)
         return self.step_images(images, timestamp, on_pose=on_pose)
 
     def step_images(
@@ -251,7 +225,7 @@ class Slam:
                 the result.
             on_pose: as in ``step``.
         """
-        return self._step(images, timestamp, StageClock(dict(stage_ms or {})), on_pose)
+        return self._session.step(images, timestamp, stage_ms, on_pose)
 
     def step_features(
         self,
@@ -270,113 +244,11 @@ class Slam:
             stage_ms: wall time of the stages before this call, in milliseconds. It is included in
                 the result.
         """
-        images = GivenFeatures(extracted, image)
-        return self._step(images, timestamp, StageClock(dict(stage_ms or {})))
-
-    def _step(
-        self,
-        images: Images,
-        timestamp: float,
-        clock: StageClock,
-        on_pose: Callable[[TrackResult], None] = _ignore,
-    ) -> TrackResult:
-        self._check(timestamp)
-        self._publish_due()
-        clock.lap("wait_for_mapping")
-        if self._mapper.n_keyframes:
-            track, predicted = self._track(images, timestamp, clock)
-            track = self._record(track, predicted)
-            on_pose(self._result(track, dict(clock.ms)))
-            by_patches = track.by_patches
-            track = self._mode.update_map(track, images, predicted)
-            # If patches failed for this frame, they will probably fail for the next frames.
-            self.next_extraction = self._mode.due if by_patches else track.index + 2
-        else:
-            track = self._begin_map(images, timestamp, clock)
-            on_pose(self._result(track, dict(clock.ms)))
-        self._keep(track, images)
-        clock.lap("keyframe")
-        return self._result(track, clock.ms)
-
-    def _publish_due(self) -> None:
-        """Publish what is due at the next frame. The last frame moves with the map."""
-        mapper, last = self._mapper, () if self._last is None else (self._last,)
-        moved = mapper.publish(*last, frame=len(mapper.frames))
-        self._last = moved[0] if moved else None
-
-    def _track(
-        self, images: Images, timestamp: float, clock: StageClock
-    ) -> tuple[Track, Prediction]:
-        """Track the next frame from its predicted pose, and relocalise it if this fails."""
-        mapper, tracker = self._mapper, self._tracker
-        predicted = self._motion.predict(timestamp, self._last, mapper.view)
-        track = tracker.track(images, predicted, mapper.view, clock)
-        if track.is_lost and (last := self._mode.map_far_points(self._last)) is not None:
-            predicted = self._motion.predict(timestamp, last, mapper.view)
-            track = tracker.track(images, predicted, mapper.view, clock)
-        seen = predicted.last_seen(mapper.view)
-        if track.is_doubtful and predicted.last is not None:
-            # It is worth waiting for the map: a doubtful frame soon becomes a keyframe.
-            track, last = mapper.publish(track, predicted.last)
-            predicted = replace(predicted, last=last)
-        if track.is_doubtful or (track.is_lost and mapper.is_published):
-            track = self._relocaliser.check(track, images, mapper.wait(), seen)
-            clock.lap("relocalise")
-        self._last = predicted.last
-        return track, predicted
-
-    def _record(self, track: Track, predicted: Prediction) -> Track:
-        """Record the pose of a frame, and return the frame with its velocity."""
-        track = self._motion.advance(track, predicted, self._mapper.view)
-        self._mapper.record(track)
-        self._last = predicted.last if track.is_lost else track
-        return track
-
-    def _begin_map(self, images: Images, timestamp: float, clock: StageClock) -> Track:
-        view = self._mapper.view
-        predicted = self._motion.predict(timestamp, self._last, view)
-        track = self._tracker.extract(images, predicted, view)
-        clock.lap("extract")
-        track = self._mode.begin(self._record(track, predicted), images.image)
-        n = len(track.tracked)
-        state = TrackingState.OK if track.is_keyframe else TrackingState.LOST
-        return replace(track, state=state, n_matches=n, n_inliers=n)
-
-    def _keep(self, track: Track, images: Images) -> None:
-        """End the step of a frame. The next frame is tracked from it, unless it is lost."""
-        if track.is_keyframe:
-            self._motion.keyframe()
-        if track.is_keyframe or not track.is_lost:
-            self._last = track
-        self.rig.observe(track, images)
-
-    def _result(self, track: Track, stage_ms: dict[str, float]) -> TrackResult:
-        odometry = self._motion.odometry.state
-        return TrackResult(
-            index=track.index,
-            timestamp=track.timestamp,
-            T_wc=self.context.camera.as_mounted(inverse(track.T_cw)),
-            state=track.state,
-            n_features=0 if track.by_patches else len(track.features),
-            n_stereo=track.n_stereo,
-            n_matches=track.n_matches,
-            n_inliers=track.n_inliers,
-            is_keyframe=track.is_keyframe,
-            relocalised=track.by is By.PLACE,
-            stage_ms=stage_ms,
-            T_odom_camera=odometry.T_odom_camera,
-            uncertainty=odometry.now,
-            part=self._mapper.view.part,
-            support=track.support,
-            stands_still=track.by is By.STANDSTILL,
-        )
+        return self._session.step(GivenFeatures(extracted, image), timestamp, stage_ms, _ignore)
 
     def skip(self, timestamp: float, *, dropped: bool = False) -> TrackResult:
         """Add a frame without images at the predicted pose. Its state is LOST or DROPPED."""
-        self._check(timestamp)
-        predicted = self._motion.predict(timestamp, self._last, self._mapper.view)
-        state = TrackingState.DROPPED if dropped else TrackingState.LOST
-        return self._result(self._record(replace(predicted.lost, state=state), predicted), {})
+        return self._session.skip(timestamp, dropped=dropped)
 
     def resume_odometry(self, last: TrackResult) -> None:
         """Continue ``T_odom_camera`` and its uncertainty after a drive was resumed.
@@ -387,20 +259,11 @@ class Slam:
         Args:
             last: the last result of the drive before it was resumed.
         """
-        if self._session.opened.checkpoint is None:
-            self._motion.resume_odometry(last)
+        self._session.resume_odometry(last)
 
     def finish(self) -> None:
         """Complete all mapping. The map and trajectory then do not change until the next step."""
-        moved = self._mapper.finish(*(() if self._last is None else (self._last,)))
-        self._last = moved[0] if moved else None
-
-    def _check(self, timestamp: float) -> None:
-        frames = self._mapper.frames
-        if not math.isfinite(timestamp):
-            raise ValueError(f"timestamp {timestamp} s must be a finite number")
-        if len(frames) and not timestamp > (last := frames.timestamp(-1)):
-            raise ValueError(f"timestamp {timestamp} s is not later than the last one, {last} s")
+        self._session.finish()
 
     @property
     def map(self) -> Map:
@@ -409,12 +272,12 @@ class Slam:
         Raises:
             RuntimeError: a keyframe is being mapped. Check ``is_mapping``, or call ``finish()``.
         """
-        return self._mapper.map
+        return self._session.mapper.map
 
     @property
     def frame(self) -> Track | None:
         """The last tracked frame, for visualisation. None before the first tracked frame."""
-        return self._last
+        return self._session.last
 
     @property
     def truth_alignment(self) -> TruthAlignment | None:
@@ -424,17 +287,17 @@ class Slam:
     @property
     def is_mapping(self) -> bool:
         """Whether a keyframe is being mapped."""
-        return self._mapper.is_mapping
+        return self._session.mapper.is_mapping
 
     @property
     def is_adjusting(self) -> bool:
         """Whether a global bundle adjustment is running, or its result has not been applied yet."""
-        return self._closing.is_adjusting
+        return self._session.closing.is_adjusting
 
     @property
     def loops(self) -> list[LoopEdge]:
         """The outcomes of all loop candidates so far."""
-        return self._closing.edges
+        return self._session.closing.edges
 
     @property
     def problems(self) -> list[str]:
@@ -443,31 +306,27 @@ class Slam:
         Such failures are a failed search for loops, a failed global bundle adjustment, and a right
         image that could not be read.
         """
-        return [*self._closing.problems, *self.rig.problems]
+        return [*self._session.closing.problems, *self.rig.problems]
 
     @property
     def corrections(self) -> list[LoopCorrection]:
         """The correction of the keyframes by each closed loop."""
-        return self._closing.corrections
+        return self._session.closing.corrections
 
     def trajectory(self) -> Trajectory:
         """Return the pose of every frame. The poses of lost frames are interpolated."""
-        return self._as_mounted(self._mapper.trajectory())
+        return _as_mounted(self._session.mapper.trajectory(), self.context.camera)
 
     def keyframe_trajectory(self) -> Trajectory:
         """Return the poses of the keyframes of this drive, without culled keyframes."""
-        return self._as_mounted(keyframe_trajectory(self.map))
-
-    def _as_mounted(self, trajectory: Trajectory) -> Trajectory:
-        T_wc = self.context.camera.as_mounted(trajectory.T_wc)
-        return replace(trajectory, T_wc=T_wc)
+        return _as_mounted(keyframe_trajectory(self.map), self.context.camera)
 
     def in_map(self) -> NDArray[np.bool_]:
         """Return an ``(N,)`` bool array, True for frames that were tracked in the first sub-map.
 
         Sub-maps that closed loops have joined to the first sub-map count as part of it.
         """
-        return in_first_part(self.map, self._closing.closed, self._mapper.frames.table())
+        return in_first_part(self.map, self._session.closing.closed, self._session.mapper.frames)
 
     def gaps(self) -> list[Gap]:
         """Return the stretches of this drive whose poses relative to the world were not measured.
@@ -478,6 +337,5 @@ class Slam:
         Raises:
             RuntimeError: a keyframe is being mapped. Check ``is_mapping``, or call ``finish()``.
         """
-        config, monocular = self.context.config.pose_graph, self.context.camera.monocular
-        scale = math.exp(config.gap_scale) if monocular else 1.0
-        return find_gaps(self.map, self._closing.closed, self._mapper.frames, scale)
+        closing, mapper = self._session.closing, self._session.mapper
+        return find_gaps(self.map, closing.closed, mapper.frames, self.context)

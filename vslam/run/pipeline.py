@@ -34,7 +34,7 @@ from vslam.run.moving_objects import moving_object_warnings
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome, causal_trajectory, ground_truth_of
 from vslam.run.pair import PairCheck
-from vslam.run.preparation import Played, PreparedFrame, at_their_times
+from vslam.run.preparation import FramesAhead, Played, PreparedFrame
 from vslam.run.progress import Progress, TrackLog, in_frames
 from vslam.run.recorder import Recorder
 from vslam.run.rig import (
@@ -97,17 +97,18 @@ def run_sequence(
         frames = pair.watch(_until_broken(sequence.frames(), end_reasons))
         frames = perturbed(frames, perturbation)
         frames = _following(frames, main.before.tracks.timestamps)
+        ahead = FramesAhead(
+            frames,
+            slam.context,
+            slam.workers,
+            realtime=settings.realtime,
+            live=sequence.live,
+            begin=len(main.tracks),
+        )
         try:
-            for played in at_their_times(
-                frames,
-                slam.context,
-                slam.workers,
-                realtime=settings.realtime,
-                live=sequence.live,
-                begin=len(main.tracks),
-                next_extraction=lambda: slam.next_extraction,
-            ):
+            for played in ahead:
                 result = main.step(played)
+                ahead.request(result.next_extraction)
                 if (frame := played.prepared) is not None and frame.problem and not frame.dropped:
                     _log.warning("frame %d skipped: %s", result.index, frame.problem)
                 autosave.frame(result)

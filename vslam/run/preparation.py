@@ -213,79 +213,80 @@ class PreparedFrame:
     dropped: bool = False
 
 
-def at_their_times(
-    frames: Iterator[TimedFrame],
-    context: Context,
-    workers: Workers,
-    *,
-    realtime: bool,
-    live: bool,
-    begin: int = 0,
-    next_extraction: Callable[[], int] = lambda: -1,
-) -> Iterator[Played[PreparedFrame]]:
-    """Yield prepared frames in order, each with its time of arrival.
+class FramesAhead:
+    """Prepared frames in order, each with its time of arrival.
 
     In a real-time run, a frame arrives at its timestamp. In other runs, all frames count as arrived
-    at the start of the run.
-
-    Args:
-        live: see ``play``.
-        begin: index of the first frame.
-        next_extraction: function that returns ``Slam.next_extraction``, the index of a frame whose
-            features should be extracted in advance.
+    at the start of the run. If there are several threads, some frames are prepared in advance.
     """
-    if realtime:
+
+    def __init__(
+        self,
+        frames: Iterator[TimedFrame],
+        context: Context,
+        workers: Workers,
+        *,
+        realtime: bool,
+        live: bool,
+        begin: int = 0,
+    ) -> None:
+        """
+        Args:
+            live: see ``play``.
+            begin: index of the first frame.
+        """
+        self._frames = frames
+        self._context = context
+        self._workers = workers
+        self._realtime = realtime
+        self._live = live
+        self._begin = begin
+        self._requested = -1
+
+    def request(self, index: int) -> None:
+        """Extract the features of a later frame in advance (``TrackResult.next_extraction``)."""
+        self._requested = index
+
+    def __iter__(self) -> Iterator[Played[PreparedFrame]]:
+        return self._as_they_arrive() if self._realtime else self._in_advance()
+
+    def _as_they_arrive(self) -> Iterator[Played[PreparedFrame]]:
+        threads = self._workers.threads
         with ThreadPoolExecutor(2, "side") as pool:
-            image_map = map if workers.threads == 1 else pool.map
+            image_map = map if threads == 1 else pool.map
 
             def prepare(number: int, frame: TimedFrame) -> PreparedFrame:
-                prepared = prepare_frame(frame, context, image_map)
-                is_due = 0 <= next_extraction() <= begin + number
-                if prepared.images is not None and is_due and workers.threads > 1:
-                    prepared.images.start_corners(workers)
+                prepared = prepare_frame(frame, self._context, image_map)
+                is_due = 0 <= self._requested <= self._begin + number
+                if prepared.images is not None and is_due and threads > 1:
+                    prepared.images.start_corners(self._workers)
                 return prepared
 
-            yield from play(frames, prepare, workers.threads, live=live)
-        return
-    start = time.perf_counter()
-    ahead = prepared_frames(frames, context, workers, begin, next_extraction)
-    for timestamp, prepared in ahead:
-        yield Played(timestamp, prepared, start)
+            yield from play(self._frames, prepare, threads, live=self._live)
 
-
-def prepared_frames(
-    frames: Iterator[TimedFrame],
-    context: Context,
-    workers: Workers,
-    begin: int = 0,
-    next_extraction: Callable[[], int] = lambda: -1,
-) -> Iterator[tuple[float, PreparedFrame]]:
-    """Yield timestamps and prepared frames in order.
-
-    If there are several threads, some frames are prepared in advance.
-    """
-    ahead: deque[tuple[float, Job[PreparedFrame]]] = deque()
-    n_ahead = _AHEAD * workers.threads if workers.threads > 1 else 1
-    requested = -1
-    try:
-        for frame in frames:
-            prepare = partial(prepare_frame, frame, context)
-            ahead.append((frame.timestamp, workers.submit(prepare, Urgency.READING)))
-            if len(ahead) == n_ahead:
-                timestamp, prepared = ahead.popleft()
-                yield timestamp, prepared.result()
-                begin += 1
-                due = next_extraction()
-                if due > requested and 0 <= due - begin < len(ahead):
-                    images = ahead[due - begin][1].result().images
-                    if images is not None:
-                        images.start_corners(workers)
-                    requested = due
-        for timestamp, prepared in ahead:
-            yield timestamp, prepared.result()
-    finally:
-        for _, prepared in reversed(ahead):
-            prepared.cancel()
+    def _in_advance(self) -> Iterator[Played[PreparedFrame]]:
+        workers, start, begin, started = self._workers, time.perf_counter(), self._begin, -1
+        ahead: deque[tuple[float, Job[PreparedFrame]]] = deque()
+        n_ahead = _AHEAD * workers.threads if workers.threads > 1 else 1
+        try:
+            for frame in self._frames:
+                prepare = partial(prepare_frame, frame, self._context)
+                ahead.append((frame.timestamp, workers.submit(prepare, Urgency.READING)))
+                if len(ahead) == n_ahead:
+                    timestamp, prepared = ahead.popleft()
+                    yield Played(timestamp, prepared.result(), start)
+                    begin += 1
+                    due = self._requested
+                    if due > started and 0 <= due - begin < len(ahead):
+                        images = ahead[due - begin][1].result().images
+                        if images is not None:
+                            images.start_corners(workers)
+                        started = due
+            for timestamp, prepared in ahead:
+                yield Played(timestamp, prepared.result(), start)
+        finally:
+            for _, prepared in reversed(ahead):
+                prepared.cancel()
 
 
 def prepare_frame(frame: TimedFrame, context: Context, image_map: ImageMap = map) -> PreparedFrame:

@@ -264,6 +264,10 @@ class Pairing:
         self.left_out = np.delete(times, paired).tolist()
         self.seconds = seconds.tolist()
 
+    def add_pair(self) -> None:
+        """Count a pair of a stream."""
+        self.n_pairs += 1
+
     def count_names(self, pairs: ClockPairs, n_images: int, n_partners: int) -> None:
         """Count images that were paired by their names. The index of an image replaces its time."""
         self.n_pairs = len(pairs.first)

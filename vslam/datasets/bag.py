@@ -329,7 +329,7 @@ def _synchronised(
             early, late = (first, second) if apart < 0 else (second, first)
             behind = abs(stamp_of(early[1]) - stamp_of(late[0])) if len(early) > 1 else tolerance
             if abs(apart) <= min(behind, tolerance):
-                pairing.n_pairs += 1
+                pairing.add_pair()
                 yield first.popleft(), second.popleft()
                 continue
             # After a clock was set back, the next late message is nearer to the early one.

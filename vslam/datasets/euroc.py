@@ -192,11 +192,12 @@ def _pair(cameras: list[Path], times: list[NDArray[np.int64]]) -> NDArray[np.int
 
 def _pairing(base: Path, times: list[NDArray[np.int64]], frames: NDArray[np.int64]) -> Pairing:
     fix = "restore the missing images, or run on the left camera alone with --sensor mono"
-    pairing = Pairing(base, "right image", _MOST_APART_NS * 1e-9, fix)
     left, right = (1e-9 * (side - times[0][0]) for side in times)
-    pairing.late_s = float(np.median(right[frames[:, 1]] - left[frames[:, 0]]))
-    pairing.count(left, frames[:, 0], right - pairing.late_s)
-    pairing.n_alone = len(right) - len(frames)
+    late_s = float(np.median(right[frames[:, 1]] - left[frames[:, 0]]))
+    alone = len(right) - len(frames)
+    apart = _MOST_APART_NS * 1e-9
+    pairing = Pairing(base, "right image", apart, fix, n_alone=alone, late_s=late_s)
+    pairing.count(left, frames[:, 0], right - late_s)
     return pairing
 
 

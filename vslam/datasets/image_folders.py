@@ -348,10 +348,11 @@ def _paired(
             "pair the same number."
         )
     fix = "restore the missing files, or run with --sensor mono"
-    pairing = Pairing(folders[0], "depth image" if depth else "right image", 0.0, fix)
-    pairing.count_names(pairs, len(first), len(rest[0]))
+    partner, late_s = "depth image" if depth else "right image", 0.0
     if timed and abs(pairs.offset) > _CLOCKS_DIFFER * pairs.within:
-        pairing.late_s = float(np.median(times[1][pairs.second] - times[0][pairs.first]))
+        late_s = float(np.median(times[1][pairs.second] - times[0][pairs.first]))
+    pairing = Pairing(folders[0], partner, 0.0, fix, late_s=late_s)
+    pairing.count_names(pairs, len(first), len(rest[0]))
     return [pairs.first, pairs.second], pairing
 
 

@@ -84,7 +84,7 @@ REALTIME = ("--realtime", "--max-frames", "12")
 LATER = ("report.json", "report.md", "report.html", "figures")  # written after all other results
 POINTS = (
     Point("a frame's track", "vslam.frontend.tracker.Tracker.track", 200, EARLY),
-    Point("keyframe policy", "vslam.modes.MapBuilding.update_map", 200, EARLY),
+    Point("keyframe policy", "vslam.modes.Building.update_map", 200, EARLY),
     Point("publishing a keyframe", "vslam.mapping.Mapper._renew_view", 8, EARLY),
     Point("place detector, locate", "ring.Oracle.locate", 2, EARLY),
     Point("place detector, add", "ring.Oracle.add", 12, ON),

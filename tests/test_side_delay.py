@@ -42,7 +42,8 @@ def points(delay: float, k: int, n: int = 200) -> np.ndarray:
         return CAMERA.fy * p[:, 1] / p[:, 2]
 
     offset = rows(delay) - rows(0.0) + rng.normal(0.0, 0.1, n)
-    return np.column_stack([offset, (rows(0.01) - rows(-0.01)) / 0.02, xy])
+    disparity = CAMERA.bf / seen[:, 2] / CAMERA.width
+    return np.column_stack([offset, (rows(0.01) - rows(-0.01)) / 0.02, xy, disparity])
 
 
 @pytest.mark.parametrize("delay", [-8e-3, 3e-3, 12e-3])
@@ -57,8 +58,9 @@ def test_a_delay_is_measured_and_reported_unless_the_calibration_gives_it(delay)
 def test_nothing_is_said_of_a_rig_whose_rows_do_not_correspond():
     several = [points(0.0, k) for k in range(0, 80, 4)]
     for k, one in enumerate(several):
-        x, y = one[:, 2:].T
+        x, y, disparity = one[:, 2:].T
         one[:, 0] += 0.5 * x - 0.7 * x * y**2 + 0.2 * (-1) ** k  # turned, distorted, vibrating
+        one[:, 0] += (3.0 - 5.0 * y) * disparity  # displaced
     found = fit_delay(several)
     assert abs(found.seconds) < 0.3e-3
     assert not found.is_wrong(CAMERA, CONFIG)
@@ -66,7 +68,7 @@ def test_nothing_is_said_of_a_rig_whose_rows_do_not_correspond():
 
 def test_a_few_frames_are_not_believed():
     several = [points(8e-3, k) for k in range(9)]
-    assert fit_delay([*several, np.zeros((0, 4))]) is None
+    assert fit_delay([*several, np.zeros((0, 5))]) is None
     assert measure_delay([late_frame(0.0, k) for k in range(49)]) is None
 
 

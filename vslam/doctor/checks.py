@@ -203,10 +203,8 @@ def check_synchronisation(rows_of_lag: Mapping[int, float]) -> tuple[Finding, in
     return finding, best
 
 
-def check_delay(found: SideDelay | None, camera: Camera, config: StereoConfig) -> Finding:
+def check_delay(found: SideDelay, camera: Camera, config: StereoConfig) -> Finding:
     """Check whether the right image has the delay that the calibration gives."""
-    if found is None:
-        return Finding("delay", "unknown", "too few frames with matches that move")
     sigma = f"(standard deviation {1e3 * found.sigma:.1f} ms)"
     wrong = found.is_wrong(camera, config)
     return judge("delay", wrong, f"{found.description()} {sigma}", found.remedy())

@@ -196,8 +196,8 @@ def _examine_stereo(
             [(pair.left, pair.right) for pair in pairs], [pair.matches for pair in pairs]
         ),
     ]
-    if synchronised.verdict == "good":
-        delay = measure_delay(sequence.stored)
+    delay = measure_delay(sequence.stored) if synchronised.verdict == "good" else None
+    if delay is not None:
         findings.insert(1, checks.check_delay(delay, sequence.camera, config.stereo))
     findings += _examine_focal_length(sequence, findings)
     shown = sorted(pairs, key=lambda pair: -len(pair.matches))[:_PICTURES]

@@ -4,10 +4,11 @@ In a rectified pair, a point lies in the same row of both images. If the right i
 the point moves in the image during the delay. Its row in the right image is then shifted by its
 image velocity times the delay. The velocity is known from the left images before and after.
 
-The column of the point is shifted as well, but only the row shift does not depend on depth.
-A wrong calibration also shifts the rows, but by the same amount at every speed. A polynomial of the
-image position models this part of the row shift. In addition, each frame has a random row shift,
-because the velocity at the exposure is not exactly the mean velocity if the camera vibrates.
+A wrong calibration also shifts the rows, but by the same amount at every speed. It is modelled by a
+polynomial of the image position (wrong directions) and by terms that are proportional to the
+disparity (wrong positions of the cameras). A delay at constant velocity cannot be distinguished
+from such an error. In addition, each frame has a random row shift, because the velocity at the
+exposure is not exactly the mean velocity if the camera vibrates.
 
 The measured delay is reported, but it is not corrected during the run, because the map is already
 distorted when enough frames have been seen. To correct the delay, set ``Camera.right_delay`` in the
@@ -50,8 +51,8 @@ class SideDelay:
     Attributes:
         seconds: the delay in seconds, positive if the right image is taken later than the left
             image.
-        sigma: standard deviation of ``seconds``, estimated from the disagreement between frames
-            (cluster-robust: Liang and Zeger, Biometrika 1986).
+        sigma: standard deviation of ``seconds``, estimated by leaving out one frame at a time
+            (jackknife: Efron and Stein, Annals of Statistics 1981).
     """
 
     seconds: float
@@ -94,9 +95,9 @@ def fit_delay(several: Sequence[NDArray[np.float64]]) -> SideDelay | None:
     """Fit the delay to the row shifts in several frames by least squares (Huber loss).
 
     Args:
-        several: for each frame, ``(N, 4)``: the row of a point in the right image minus its row in
-            the left image (px), the velocity of this row (px/s), and the position of the point in
-            the image, from -1 to 1.
+        several: for each frame, ``(N, 5)``: the row of a point in the right image minus its row in
+            the left image (px), the velocity of this row (px/s), the position of the point in the
+            image, from -1 to 1, and its disparity, relative to the image width.
 
     Returns:
         None if too few frames have points, or if the points hardly move.
@@ -106,20 +107,22 @@ def fit_delay(several: Sequence[NDArray[np.float64]]) -> SideDelay | None:
     if n < _FEWEST:
         return None
     frame = np.repeat(np.arange(n), [len(points) for points in several])
-    offset, speed, x, y = np.concatenate(several).T
+    offset, speed, x, y, disparity = np.concatenate(several).T
     if speed.std() < _STILL:
         return None
     powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-    table = np.column_stack([speed, *powers, offset])
+    displaced = [disparity, x * disparity, y * disparity]
+    table = np.column_stack([speed, *powers, *displaced, offset])
     weight, removed = np.ones(len(table)), np.zeros(n)
+    ends = np.cumsum([len(points) for points in several])[:-1]
     for _ in range(_ROUNDS):
         total = np.bincount(frame, weight)
         means = np.column_stack([np.bincount(frame, weight * one) / total for one in table.T])
         reduced = table - (removed[:, None] * means)[frame]
-        A, b = reduced[:, :-1], reduced[:, -1]
-        inverse = np.linalg.pinv((A * weight[:, None]).T @ A, rcond=1e-12, hermitian=True)
-        solution = inverse @ (A.T @ (weight * b))
-        residual = b - A @ solution
+        weighted = np.split(reduced * np.sqrt(weight)[:, None], ends)
+        moments = np.array([one.T @ one for one in weighted])
+        solution = _solve(moments.sum(axis=0))
+        residual = reduced[:, -1] - reduced[:, :-1] @ solution
         # Random effects: each frame has a row shift of its own, with a variance that is estimated.
         own = means[:, -1] - means[:, :-1] @ solution
         rest = table[:, -1] - table[:, :-1] @ solution - own[frame]
@@ -127,9 +130,16 @@ def fit_delay(several: Sequence[NDArray[np.float64]]) -> SideDelay | None:
         variance = max(np.mean(own**2) - noise * np.mean(1.0 / total), 0.0)
         removed = 1.0 - np.sqrt(noise / (noise + total * variance))
         weight = np.minimum(1.0, _HUBER_PX / np.maximum(np.abs(residual), 1e-9))
-    influence = np.bincount(frame, weight * residual * (A @ inverse[0]))
-    sigma = np.sqrt(n / (n - 1) * influence @ influence)
-    return SideDelay(float(solution[0]), float(sigma))
+    without = np.array([_solve(moments.sum(axis=0) - one)[0] for one in moments])
+    return SideDelay(float(solution[0]), float(np.sqrt(n - 1) * without.std()))
+
+
+def _solve(moments: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Solve a linear least-squares problem, given the second moments of its variables, of which the
+    last one is the measurement."""
+    inverse = np.linalg.pinv(moments[:-1, :-1], rcond=1e-12, hermitian=True)
+    solution: NDArray[np.float64] = inverse @ moments[:-1, -1]
+    return solution
 
 
 def _row_motion(before: TimedFrame, frame: TimedFrame, after: TimedFrame) -> NDArray[np.float64]:
@@ -137,20 +147,21 @@ def _row_motion(before: TimedFrame, frame: TimedFrame, after: TimedFrame) -> NDA
     after it.
 
     Returns:
-        ``(N, 4)`` the points, see ``fit_delay``.
+        ``(N, 5)`` the points, see ``fit_delay``.
     """
     elapsed = after.timestamp - before.timestamp
     left, right = frame.read(map)
     if right is None or elapsed > _LONGEST_S:
-        return np.zeros((0, 4))
+        return np.zeros((0, 5))
     right = np.asarray(right, np.uint8)
     matches = match_described(describe(left, _FEATURES), describe(right, _FEATURES))
     if not len(matches):
-        return np.zeros((0, 4))
+        return np.zeros((0, 5))
     earlier, later = (_track(left, _left(other), matches.left) for other in (before, after))
-    shift = matches.right[:, 1] - matches.left[:, 1]
+    shift = matches.right - matches.left
     position = 2.0 * matches.left / left.shape[::-1] - 1.0
-    found = np.column_stack([shift, (later - earlier)[:, 1] / elapsed, position])
+    speed = (later - earlier)[:, 1] / elapsed
+    found = np.column_stack([shift[:, 1], speed, position, -shift[:, 0] / left.shape[1]])
     return found[np.isfinite(found).all(axis=1)]
 
 

@@ -1,6 +1,7 @@
 """Tests the temporal consistency of loops.
 
-A loop is accepted only if several keyframes propose the same place and their verified loops agree.
+A loop is accepted if it is sufficiently improbable that it is wrong. If its own evidence is not
+overwhelming, a loop of another keyframe must agree with it.
 
 ORB-SLAM (T-RO 2015, section VII-A) requires that the candidates of consecutive keyframes belong to
 overlapping places. This evidence comes from appearance only. Geometry gives stronger evidence. Each
@@ -78,58 +79,78 @@ class LoopConsistency:
         return consistent, rejected
 
     def confirm(self, edge: LoopEdge, map_: Map) -> LoopEdge:
-        """Accept a verified loop edge only if the loops of enough recent keyframes imply the same
-        drift.
+        """Accept a verified loop edge only if it is sufficiently improbable that it is wrong.
+
+        A recent loop of another keyframe confirms the edge if both imply the same drift. Then, the
+        edge is wrong only if both are wrong, so their probabilities are multiplied. Neighbouring
+        keyframes see similar things, so only one other loop counts.
 
         The drift that an edge implies is a motion of the world. This motion would move the query
         keyframe to where the edge places it. Odometry between neighbouring keyframes is accurate
         compared with the tolerances. True loops therefore imply the same drift, and false loops do
         not.
 
-        A keyframe counts only once, even if several of its loop edges agree.
-
         Returns:
-            The loop edge. It is marked as not accepted if the loops of too few keyframes agree.
+            The loop edge with the resulting probability. It is marked as not accepted if this
+            probability is too large.
         """
         if not edge.accepted:
             return edge
         oldest = self._turn - self.config.verified_memory
         self._verified = [(turn, e) for turn, e in self._verified if turn >= oldest]
-        agreeing = {
-            other.query
+        agreeing = [
+            other.p_wrong
             for _, other in self._verified
             if other.query != edge.query and self.agree(edge, other, map_)
-        }
-        votes = 1 + len(agreeing)  # including the keyframe of this edge
+        ]
         self._verified.append((self._turn, edge))
-        if votes >= self.config.min_verified:
-            return edge
-        reason = f"verified by {votes} of {self.config.min_verified} keyframes"
-        return replace(edge, accepted=False, reason=reason)
+        return self._decided(edge, min(agreeing, default=1.0), self.config.max_wrong)
 
-    def confirmed_by_earlier(
+    def decided_at_end(
         self, map_: Map, camera: Camera, config: VerificationConfig
     ) -> Iterator[LoopEdge]:
-        """Some verified loops wait because too few other loops agree with them. Yield those that an
-        earlier keyframe confirms, newest first.
+        """Decide at the end of a drive about the verified loops that wait for another loop that
+        agrees with them. Yield those that are accepted, newest first.
 
-        An earlier keyframe confirms a loop if three conditions are met. The keyframe is covisible
+        A loop is verified once more in the corrected map, using ORB descriptors. If this succeeds,
+        an earlier keyframe may confirm it. Three conditions must be met. The keyframe is covisible
         with the query of the loop. The keyframe can be verified at the same place as the query.
-        Both loops imply the same drift.
+        Both loops imply the same drift. ORB-SLAM3 (section VI) also tries covisible keyframes
+        before it waits for later keyframes.
 
-        ORB-SLAM3 (section VI) also tries covisible keyframes before it waits for later keyframes.
+        If this does not suffice, for example because ORB descriptors do not match, the loop is
+        decided on its own evidence. Since no further evidence will come, a larger probability that
+        it is wrong is allowed.
         """
+        nothing = np.empty(0, np.int32)
         oldest = self._turn + 1 - self.config.verified_memory
         for waiting in [edge for turn, edge in reversed(self._verified) if turn >= oldest]:
             if not map_.arrays.keyframe_alive[[waiting.query, waiting.match]].all():
                 continue
-            edge = verify_near(map_, waiting, camera, config)
-            if edge.accepted and self._is_confirmed(edge, map_, camera, config):
+            edge, limit = verify_near(map_, waiting, camera, config), self.config.max_wrong_at_end
+            if edge.accepted:
+                edge = self._decided(edge, self._p_earlier(edge, map_, camera, config), limit)
+            if not edge.accepted:  # the matches that it had may have been culled
+                edge = replace(waiting, features=nothing, landmarks=nothing)
+                edge = self._decided(edge, 1.0, limit)
+            if edge.accepted:
                 yield edge
 
-    def _is_confirmed(
+    def _decided(self, edge: LoopEdge, p_other: float, max_wrong: float) -> LoopEdge:
+        """Accept a verified edge, or not, given the probability that the loop that confirms it is
+        wrong."""
+        p_wrong = edge.p_wrong * p_other
+        edge = replace(edge, p_wrong=p_wrong)
+        if p_wrong <= max_wrong:
+            return edge
+        reason = f"verified, but wrong with probability {p_wrong:.2g}; no keyframe confirms it"
+        return replace(edge, accepted=False, reason=reason)
+
+    def _p_earlier(
         self, edge: LoopEdge, map_: Map, camera: Camera, config: VerificationConfig
-    ) -> bool:
+    ) -> float:
+        """Return the probability that the loop of an earlier keyframe that confirms ``edge`` is
+        wrong. It is 1 if no keyframe confirms it."""
         assert edge.T_query_match is not None
         assert edge.landmarks is not None
         T_query_w = edge.T_query_match @ map_.keyframe_pose(edge.match)
@@ -145,8 +166,8 @@ class LoopConsistency:
             )
             other = verify_near(map_, expected, camera, config)
             if other.accepted and self.agree(edge, other, map_):
-                return True
-        return False
+                return other.p_wrong
+        return 1.0
 
     def agree(self, edge: LoopEdge, other: LoopEdge, map_: Map) -> bool:
         """Return whether two loop edges imply the same drift at the query of the first edge."""

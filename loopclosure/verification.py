@@ -7,8 +7,7 @@ section III-D). The descriptors of two keyframes are matched, and a motion is es
 Then all landmarks of the place are matched near their projections, and the pose is refined.
 
 ORB-SLAM then only counts inliers. However, two different facades or cars that look alike also give
-many inliers. This module therefore adds two tests. The inliers must be spread over the image. In
-addition, most landmarks of one keyframe must be found at their projections in the other keyframe.
+many inliers. This module therefore weighs further evidence (``vslam.loopclosure.evidence``).
 """
 
 from __future__ import annotations
@@ -26,20 +25,19 @@ from vslam.frontend.matching import (
     Projections,
     Searchable,
     consistent_orientation,
-    count_elsewhere,
     predict_view,
     search_all,
     search_windows,
 )
 from vslam.frontend.pose import optimise_pose, pose_covariance
 from vslam.geometry import Matrix, inverse, orthonormalised, transform
+from vslam.loopclosure.evidence import evidence_of, weighed
 from vslam.loopclosure.sim3_ransac import ObservedPoints, align
 from vslam.loops import LoopCandidate, LoopEdge
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
 from vslam.reprojection import stack_uvr
 
-GRID_COLUMNS, GRID_ROWS = 8, 4
 MIN_DEPTHS = 10  # least number of features with landmarks on both sides to estimate the scale
 
 
@@ -122,12 +120,27 @@ def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationC
         features=guided.feature[guided.seen],
         landmarks=guided.landmarks[guided.seen],
         covariance=guided.covariance,
+        matched_by="orb",
     )
     if camera.monocular:
         scale = relative_scale(map_, edge, guided.T_cw, default=edge.scale)
         edge = replace(edge, scale=scale)
-    reason = _rejection_reason(map_, edge, guided, camera, config)
-    return replace(edge, accepted=not reason, reason=reason or "verified")
+    if reason := distance_reason(edge, config):
+        return replace(edge, reason=reason)
+    if edge.n_inliers < config.min_inliers:
+        return replace(edge, reason=f"only {edge.n_inliers} landmarks of the place fit")
+    evidence = evidence_of(
+        guided.uv,
+        guided.seen,
+        map_.arrays.xyz[guided.landmarks],
+        guided.T_cw,
+        guided.covariance,
+        camera.intrinsics[0],
+        camera.width,
+        seen_of(map_, edge.match, guided),
+        seen_of(map_, edge.query, reverse_match(map_, edge, camera, config)),
+    )
+    return weighed(edge, evidence)
 
 
 def match_keyframes(
@@ -289,55 +302,11 @@ def guided_match(
     )
 
 
-def _rejection_reason(
-    map_: Map,
-    edge: LoopEdge,
-    guided: GuidedMatches,
-    camera: Camera,
-    config: VerificationConfig,
-) -> str:
-    """Return the reason to reject a loop, or "" if it passes all tests."""
+def distance_reason(edge: LoopEdge, config: VerificationConfig) -> str:
+    """Return the reason to reject a loop whose keyframes are too far apart, or ""."""
     assert edge.T_query_match is not None
-    if edge.n_inliers < config.min_inliers:
-        return f"only {edge.n_inliers} landmarks of the place fit"
-    if edge.n_inliers < config.min_inlier_ratio * edge.n_matches:
-        return f"only {edge.n_inliers} of {edge.n_matches} matches fit"
     distance = float(np.linalg.norm(inverse(edge.T_query_match)[:3, 3]))
-    if distance > config.max_distance:
-        return f"the pose is {distance:.0f} m from the place"
-    if reason := spread_reason(guided.uv, guided.seen, camera, config, config.min_elsewhere):
-        return reason
-    seen, total = seen_of(map_, edge.match, guided)
-    if seen < config.min_seen_ratio * total:
-        return f"only {seen} of {total} landmarks of the place are seen"
-    seen, total = seen_of(map_, edge.query, reverse_match(map_, edge, camera, config))
-    if seen < config.min_seen_ratio * total:
-        return f"only {seen} of {total} landmarks of the query are seen from the place"
-    return ""
-
-
-def spread_reason(
-    uv: Matrix,
-    seen: NDArray[np.bool_],
-    camera: Camera,
-    config: VerificationConfig,
-    min_elsewhere: int,
-) -> str:
-    """Return the reason to reject inliers that are not spread over the image, or "".
-
-    Args:
-        uv: ``(M, 2)`` predicted positions, in pixels, of the landmarks that should be visible.
-        seen: ``(M,)`` bool, True for inliers.
-        min_elsewhere: least number of inliers outside any vertical strip with a third of the image
-            width.
-    """
-    expected, occupied = occupied_cells(uv, camera), occupied_cells(uv[seen], camera)
-    if occupied < max(config.min_cells, config.min_cell_ratio * expected):
-        return f"inliers in only {occupied} of {expected} cells of the image"
-    elsewhere = count_elsewhere(uv[seen, 0], camera.width)
-    if elsewhere < min_elsewhere:
-        return f"only {elsewhere} inliers outside one third of the image"
-    return ""
+    return f"the pose is {distance:.0f} m from the place" if distance > config.max_distance else ""
 
 
 def reverse_match(
@@ -359,10 +328,3 @@ def seen_of(map_: Map, keyframe: int, guided: GuidedMatches) -> tuple[int, int]:
     should be visible."""
     own = np.isin(guided.landmarks, map_.landmarks_of(keyframe))
     return int(np.count_nonzero(guided.seen & own)), int(np.count_nonzero(own))
-
-
-def occupied_cells(uv: Matrix, camera: Camera) -> int:
-    """Count the cells of a grid over the image that contain at least one of ``(N, 2)`` pixels."""
-    column = (uv[:, 0] * GRID_COLUMNS / camera.width).astype(np.int64)
-    row = (uv[:, 1] * GRID_ROWS / camera.height).astype(np.int64)
-    return len(np.unique(row * GRID_COLUMNS + column))

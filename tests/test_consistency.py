@@ -37,14 +37,15 @@ def candidates(query: int, *matches: int) -> list[LoopCandidate]:
     return [LoopCandidate(query, match, 0.5) for match in matches]
 
 
-def verified(query: int, match: int, error=(0.0, 0.0, 0.0), turn: float = 0.0) -> LoopEdge:
+def verified(query: int, match: int, error=(0.0, 0.0, 0.0), turn=0.0, p_wrong=0.01) -> LoopEdge:
     """Make an edge whose pose is wrong by ``error`` metres and ``turn`` degrees."""
     true = compose(
         inverse(se3_exp(np.array([0.0, 0.0, 2.0 * (query - 100), 0.0, 0.0, 0.0]))),
         inverse(STREET.keyframe_pose(match)),
     )
     wrong = se3_exp(np.array([*error, 0.0, np.radians(turn), 0.0]))
-    return LoopEdge(query, match, 0.5, True, "verified", 100, 90, compose(wrong, true))
+    T_query_match = compose(wrong, true)
+    return LoopEdge(query, match, 0.5, True, "verified", 100, 90, T_query_match, p_wrong=p_wrong)
 
 
 # -- by looks -------------------------------------------------------------------------------------
@@ -127,12 +128,29 @@ def test_two_true_edges_confirm_each_other():
     consistency.update([], STREET)
     first = consistency.confirm(verified(110, 10, (0.05, 0.02, 0.1), 0.05), STREET)
     assert not first.accepted
-    assert first.reason == "verified by 1 of 2 keyframes"
+    assert first.reason == "verified, but wrong with probability 0.01; no keyframe confirms it"
     assert first.T_query_match is not None
     consistency.update([], STREET)
     second = consistency.confirm(verified(111, 12, (-0.05, 0.0, 0.05), -0.05), STREET)
     assert second.accepted
     assert second.reason == "verified"
+
+
+def test_overwhelming_evidence_needs_no_second_keyframe():
+    consistency = LoopConsistency(ConsistencyConfig(max_wrong=1e-3))
+    consistency.update([], STREET)
+    assert consistency.confirm(verified(110, 10, p_wrong=1e-3), STREET).accepted
+    consistency.reset()
+    assert not consistency.confirm(verified(110, 10, p_wrong=2e-3), STREET).accepted
+
+
+def test_two_weak_loops_that_agree_are_too_weak_together():
+    consistency = LoopConsistency(ConsistencyConfig(max_wrong=1e-3))
+    for query in range(110, 114):
+        consistency.update([], STREET)
+        edge = consistency.confirm(verified(query, query - 100, p_wrong=0.1), STREET)
+        assert not edge.accepted
+    assert edge.p_wrong == pytest.approx(0.01)  # neighbours see similar things: only one counts
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
 # Allowed imports within a level, by module. The verification of loops matches features and
 # optimises poses like tracking.
 SIBLINGS = {
+    ("vslam.loopclosure.evidence", "vslam.frontend.matching"),
     ("vslam.loopclosure.verification", "vslam.frontend.matching"),
     ("vslam.loopclosure.verification", "vslam.frontend.pose"),
     ("vslam.loopclosure.learned_localisation", "vslam.frontend.pnp"),

@@ -36,8 +36,11 @@ from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.verifier import Verifier
 from vslam.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.map import Map
+from vslam.map_kernels import cut_path
 from vslam.plugins import reason
 from vslam.states import ClosingState
+
+MISTRACKED = "closed against the odometry"  # how the reason of such a loop begins
 
 _log = logging.getLogger(__name__)
 
@@ -193,13 +196,12 @@ class LoopClosing:
         """At the end of a drive, close a verified loop that has not been confirmed yet, and start a
         last global bundle adjustment if places were revisited.
 
-        Normally, a later keyframe confirms each loop. At the end of a drive, there is no later
-        keyframe. The loop is then closed if an earlier keyframe confirms it
-        (``LoopConsistency.confirmed_by_earlier``).
+        Normally, a later keyframe confirms such a loop. At the end of a drive, there is no later
+        keyframe, and the loop is decided without it (``LoopConsistency.decided_at_end``).
         """
         gates, found, edges = self._config.verification, None, []
         with self._failure_reported("Looking for loops"):
-            for edge in self._consistency.confirmed_by_earlier(map_, self._camera, gates):
+            for edge in self._consistency.decided_at_end(map_, self._camera, gates):
                 outcome, found = self._solve(map_, edge)
                 edges.append(outcome)
                 if found is not None:
@@ -248,9 +250,13 @@ class LoopClosing:
         solution = self._solution(map_, edge, Hypothesis.PREDICTED)
         if not solution.verdict.consistent and solution.has_gaps:
             solution = self._solution(map_, edge, Hypothesis.KIDNAPPED)
+        reason = "closed"
+        if not solution.verdict.consistent and edge.p_wrong <= self._config.loops.overwhelming:
+            reason = f"{MISTRACKED}: {solution.verdict.reason}"
+            solution = self._solution(map_, edge, Hypothesis.MISTRACKED)
         if not solution.verdict.consistent:
             return replace(edge, accepted=False, reason=solution.verdict.reason), None
-        closed = replace(edge, reason="closed")
+        closed = replace(edge, reason=reason)
         return closed, _Loop(closed, solution, start)
 
     def _close(self, map_: Map, loop: _Loop) -> None:
@@ -264,6 +270,8 @@ class LoopClosing:
         query_side = [edge.query, *strong_neighbours(map_, edge.query, self._config)]
         match_side = [edge.match, *strong_neighbours(map_, edge.match, self._config)]
         self.closed.append(edge)
+        for keyframe in solution.mistracked:  # its observations are as wrong as its pose
+            cut_path(map_.arrays, keyframe, map_.n_keyframes)
         self._correct(map_, solution)
         fuse_loop(map_, edge, query_side, match_side, self._camera, self._config)
         adjust_locally(map_, edge.query, self._camera, self._config)

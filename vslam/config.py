@@ -459,21 +459,6 @@ class VerificationConfig(Section):
     """Upper bound of the descriptor distance in guided search, in bits. [OS1 VII-B, own]"""
     min_inliers: int = Field(40, ge=6)
     """At least this many inliers must remain after guided search. [OS1 VII-B, customary]"""
-    min_inlier_ratio: float = Field(0.5, ge=0, le=1)
-    """At least this fraction of the matches of the guided search must be inliers. [own]"""
-    min_elsewhere: int = Field(15, ge=0)
-    """At least this many inliers must lie outside a vertical strip that is a third of the image
-    wide. The strip is placed where it contains as many inliers as possible. Two different places
-    that look similar often agree only in a single object. [own]"""
-    min_cells: int = Field(8, ge=1)
-    """At least this many cells of an 8 x 4 grid over the image must contain inliers. [own]"""
-    min_cell_ratio: float = Field(0.3, ge=0, le=1)
-    """At least this fraction of the grid cells into which landmarks of the place are projected must
-    contain inliers. [own]"""
-    min_seen_ratio: float = Field(0.07, ge=0, le=1)
-    """Guided search must find at least this fraction of the landmarks of the matched keyframe that
-    should be visible in the query. It must also find this fraction of the landmarks of the query
-    that should be visible in the matched keyframe. [own]"""
     max_distance: float = Field(15.0, gt=0)
     """Upper bound of the distance between the cameras of query and match, in metres. [own]"""
 
@@ -527,13 +512,6 @@ class LearnedMatchingConfig(Section):
     [own]"""
     min_inliers: int = Field(80, ge=6)
     """At least this many inliers must remain after guided search. [own]"""
-    min_elsewhere: int = Field(40, ge=0)
-    """At least this many inliers must lie outside a vertical strip that is a third of the image
-    wide. The strip is placed where it contains as many inliers as possible. [own]"""
-    min_seen_ratio: float = Field(0.3, ge=0, le=1)
-    """Guided search must find at least this fraction of the landmarks of the matched keyframe that
-    should be visible in the query. It must also find this fraction of the landmarks of the query
-    that should be visible in the matched keyframe. [own]"""
     fuse_pixels: float = Field(2.0, gt=0)
     """A keypoint can observe a matched landmark only if it lies within this distance of the
     landmark's projection, in pixels at octave 0. [own]"""
@@ -554,8 +532,12 @@ class ConsistencyConfig(Section):
     min_shared: int = Field(30, ge=1)
     """Keyframes that share at least this many landmarks with a candidate belong to the same place.
     [own]"""
-    min_verified: int = Field(2, ge=1)
-    """The verified loops of at least this many keyframes must agree. [own]"""
+    max_wrong: float = Field(1e-3, gt=0, le=0.5)
+    """A loop is closed only if the probability that it is wrong is at most this value, according to
+    its own evidence and that of a loop that agrees with it. [own]"""
+    max_wrong_at_end: float = Field(1e-2, gt=0, le=0.5)
+    """At the end of a drive, when no further evidence can come, a loop that waits is closed if this
+    probability is at most this value. [own]"""
     verified_memory: int = Field(5, ge=1)
     """A verified loop is remembered for this many keyframes. [own]"""
     max_apart: float = Field(0.5, gt=0)
@@ -612,7 +594,11 @@ class RelocalizationConfig(Section):
 
 
 class LoopConfig(Section):
-    """Global bundle adjustment after a verified loop [OS1, VII]."""
+    """Closing a verified loop, and global bundle adjustment afterwards [OS1, VII]."""
+
+    overwhelming: float = Field(1e-6, ge=0)
+    """A loop that contradicts the odometry is closed nevertheless, and odometry is taken to be
+    wrong, if the probability that the loop is wrong is at most this value. [own]"""
 
     global_iterations: int = Field(10, ge=1)
     """Upper bound of the number of iterations of global bundle adjustment.

@@ -1,9 +1,10 @@
-"""The pose graph of a loop under two hypotheses about how the camera moved while it was lost.
+"""The pose graph of a loop under three hypotheses about how the camera moved.
 
 After tracking is lost, a new sub-map begins, whose pose in the map is only predicted. Under the
 first hypothesis, the camera moved about as predicted, and the prediction is a measurement with a
 known error. Under the second hypothesis, the camera was carried to an unknown place (a "kidnapped
-robot"), and the prediction is worthless.
+robot"), and the prediction is worthless. Under the third hypothesis, tracking went wrong without
+being lost, for example because it followed a vehicle that covered the image.
 """
 
 from __future__ import annotations
@@ -16,11 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.pose_graph import (
+    COVISIBLE,
     GAP,
+    TREE,
     WEAK,
     GraphCheck,
     PoseGraph,
     check_pose_graph,
+    connectivity,
     essential_graph,
     optimise,
     parts_of,
@@ -37,10 +41,16 @@ from vslam.map import Map
 
 
 class Hypothesis(Enum):
-    """A hypothesis about how the camera moved while tracking was lost."""
+    """A hypothesis about how the camera moved between the two keyframes of a loop."""
 
-    PREDICTED = "it moved about as predicted"
-    KIDNAPPED = "it was carried to an unknown place"
+    PREDICTED = "while it was lost, it moved about as predicted"
+    KIDNAPPED = "while it was lost, it was carried to an unknown place"
+    MISTRACKED = "it did not move as tracked"
+
+
+WEAK_PLACE = 0.3  # fraction of the shared landmarks that are usual in the map
+# Standard deviations of doubtful edges under ``MISTRACKED``: metres and radians.
+MISTRACKED = np.array([100.0, 100.0, 100.0, 1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -53,18 +63,20 @@ class Solution:
         S_wc: ``(N, 4, 4)`` inverses of the optimised poses, as similarities. Their scale is 1 in a
             metric map.
         verdict: whether the edges of the optimised graph are consistent.
+        mistracked: keyframes before which tracking went wrong, under ``MISTRACKED``.
     """
 
     graph: PoseGraph
     T_cw: Matrix
     S_wc: Matrix
     verdict: GraphCheck
+    mistracked: tuple[int, ...] = ()
 
     @property
     def has_gaps(self) -> bool:
         """Whether tracking was lost between keyframes of the graph.
 
-        Without such a gap, both values of ``Hypothesis`` give the same solution.
+        Without such a gap, ``PREDICTED`` and ``KIDNAPPED`` give the same solution.
         """
         return bool(np.isin(self.graph.kind, (GAP, WEAK)).any())
 
@@ -85,19 +97,45 @@ def solve(
         edge: the new loop, whose relative pose is known.
         monocular: optimise similarities instead of rigid motions, because the scale drifts.
     """
-    predicted = hypothesis is Hypothesis.PREDICTED
+    predicted = hypothesis is not Hypothesis.KIDNAPPED
     graph = essential_graph(map_, [*closed, edge], config, driven=predicted)
+    mistracked: tuple[int, ...] = ()
+    if hypothesis is Hypothesis.MISTRACKED:
+        places = _weak_places(map_)
+        graph, mistracked = _without_odometry(graph, places), tuple(places.tolist())
+        # With a robust loss, a loop that is far from fulfilled would have no influence.
+        config = config.model_copy(update={"robust_scale": 1e6})
     T_cw = map_.arrays.T_cw[: map_.n_keyframes]
     if monocular:
         S_wc = inverses(T_cw) if predicted else _aligned_similarities(map_, closed, edge)
         start = S_wc[graph.keyframes]
         found = optimise_similarities(graph, start, config)
         verdict = check_similarity_graph(graph, start, found, config)
-        return Solution(graph, inverses(rigid(found)), found, verdict)
+        return Solution(graph, inverses(rigid(found)), found, verdict, mistracked)
     start = T_cw if predicted else _aligned(map_, closed, edge)
     graph = replace(graph, T_cw=start[graph.keyframes])
     found = optimise(graph, config)
-    return Solution(graph, found, inverses(found), check_pose_graph(graph, found, config))
+    verdict = check_pose_graph(graph, found, config)
+    return Solution(graph, found, inverses(found), verdict, mistracked)
+
+
+def _weak_places(map_: Map) -> NDArray[np.int64]:
+    """Return the keyframes before which tracking may have gone wrong: earlier keyframes share few
+    landmarks with them and later ones.
+
+    If the path is weak nowhere, it stands. A town whose streets look exactly alike gives
+    overwhelming evidence for wrong loops, which only a sound path contradicts.
+    """
+    shared = connectivity(map_)
+    return np.flatnonzero(shared < WEAK_PLACE * np.median(shared))[1:]  # the first shares nothing
+
+
+def _without_odometry(graph: PoseGraph, places: NDArray[np.int64]) -> PoseGraph:
+    """Weaken the edges of odometry that cross one of some places of the path."""
+    first, second = graph.keyframes[graph.edges].T
+    crosses = np.searchsorted(places, second, "right") > np.searchsorted(places, first, "right")
+    doubtful = crosses & np.isin(graph.kind, (TREE, COVISIBLE))
+    return replace(graph, sigmas=np.where(doubtful[:, None], MISTRACKED, graph.sigmas))
 
 
 def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:

@@ -52,6 +52,29 @@ class Localisation(NamedTuple):
     landmark: NDArray[np.int32]
 
 
+class LoopEvidence(NamedTuple):
+    """What geometric verification found at the pose of a loop.
+
+    Attributes:
+        seen: fraction of the landmarks of the match keyframe that were found at their projections
+            in the image of the query keyframe.
+        seen_back: fraction of the landmarks of the query keyframe that were found at their
+            projections in the image of the match keyframe.
+        elsewhere: the same fraction as ``seen``, of the landmarks outside a vertical strip of the
+            image that is a third of its width. The strip is placed where most were found.
+        sigma_translation: standard deviation of the translation of the pose, as the motion in the
+            image of a landmark at the median depth of those that were found, pixels. These are
+            pixels of the image in which descriptors were matched.
+        sigma_rotation: standard deviation of the rotation of the pose, in the same way.
+    """
+
+    seen: float
+    seen_back: float
+    elsewhere: float
+    sigma_translation: float
+    sigma_rotation: float
+
+
 class LastSeen(NamedTuple):
     """Where and when a camera was last tracked.
 
@@ -90,6 +113,10 @@ class LoopEdge:
             ``match``. It is 1 in metric maps. In monocular maps, it differs from 1 by the scale
             drift.
         matched_by: the kind of descriptors that were matched, "orb" or "learned".
+        evidence: what verification found. None if it did not get as far as a pose with enough
+            inliers.
+        p_wrong: probability that the edge is wrong, from the evidence of its verification and, once
+            another keyframe confirms it, of the other edge. It is 1 without evidence.
     """
 
     query: int
@@ -106,6 +133,8 @@ class LoopEdge:
     scale: float = 1.0
     matched_by: Literal["orb", "learned"] = "orb"
     proposed_by: str = ""
+    evidence: LoopEvidence | None = None
+    p_wrong: float = 1.0
 
     @classmethod
     def of(

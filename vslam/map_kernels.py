@@ -99,6 +99,16 @@ def detach_keyframe(a, keyframe):
 
 
 @kernel
+def cut_path(a, keyframe, n_keyframes):
+    """Remove what joins a keyframe and all later keyframes to the earlier ones: their observations
+    of landmarks that an earlier keyframe observed first."""
+    for row in range(a.first_row[keyframe], a.first_row[n_keyframes]):
+        landmark = a.landmark[row]
+        if landmark >= 0 and a.first_keyframe[landmark] < keyframe:
+            unlink(a, row)
+
+
+@kernel
 def observed_by(a, landmark, keyframe):
     """Return the index in ``Arrays`` of a keyframe's keypoint that observes a landmark, or -1."""
     row = a.head[landmark]

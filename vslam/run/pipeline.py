@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, same_camera
+from vslam.closing import MISTRACKED
 from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.times import jitter_warnings
@@ -355,6 +356,7 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
             *slam.problems,
             *rig_warnings(slam.rig.sides),
             *_map_warnings(slam, source.camera),
+            *_mistracked_warnings(loops, keyframe_frames),
         ],
         n_keyframes=len(slam.map.living_keyframes()),
         n_landmarks=len(slam.map.living_landmarks()),
@@ -391,6 +393,16 @@ def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
         return offset_warnings(measure_offset(slam.map, camera), camera)
     except Exception as error:  # a failed check must not end the run
         return [f"The rig could not be checked ({reason(error)})."]
+
+
+def _mistracked_warnings(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[str]:
+    return [
+        f"Tracking went wrong between frames {frames[loop.match]} and {frames[loop.query]}: they "
+        "certainly show the same place, but the tracked motion between them does not lead there. "
+        "The poses of the frames between them were corrected, but should not be trusted."
+        for loop in loops
+        if loop.accepted and loop.reason.startswith(MISTRACKED)
+    ]
 
 
 def _with_earlier(

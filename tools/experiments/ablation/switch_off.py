@@ -59,8 +59,7 @@ VARIANTS = (
     Variant("capsule network", "", "bow"),
     Variant("bag of words", "", "capsule"),
     Variant("learned verification", "verification.descriptors=orb"),
-    Variant("inliers in two thirds of the image", "verification.min_elsewhere=0"),
-    Variant("agreement of keyframes", "consistency.min_keyframes=1,consistency.min_verified=1"),
+    Variant("agreement of keyframes", "consistency.min_keyframes=1,consistency.max_wrong=0.5"),
     Variant("global bundle adjustment", "loops.global_iterations=1"),
 )
 

@@ -7,7 +7,7 @@ The steps and the tests are the same as in :mod:`vslam.loopclosure.verification`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,53 +31,11 @@ from vslam.loopclosure.verification import (
 from vslam.loops import LastSeen, Localisation, LoopCandidate, LoopEdge, LoopEvidence
 from vslam.map import Map
 from vslam.map_kernels import collect_landmarks
-from vslam.states import VerifierState
 
 # A lost frame is not recognised if its pose is wrong with a larger probability. Between different
 # places that look alike, the smallest probability in 15 rendered drives is 0.9.
 _MAX_WRONG_POSE = 0.2
 _DEPTHS_AGREE = 0.15  # largest relative difference in depth between two landmarks of one feature
-
-
-class LearnedTrials:
-    """Chooses the loop candidates for which verification with learned local descriptors is tried.
-
-    This verification takes forty times as long as verification with ORB descriptors. Therefore,
-    only the candidates that are most similar to the query are tried, and only if their similarity
-    exceeds a limit. After a failed attempt, the limit is higher for the next
-    ``learned.retry_interval`` keyframes.
-
-    Attributes:
-        state: the result of the last attempt.
-    """
-
-    def __init__(self, config: LearnedMatchingConfig) -> None:
-        self._config = config
-        self.state = VerifierState()
-
-    def choose(self, keyframe: int, candidates: Collection[LoopCandidate]) -> set[int]:
-        """Choose the candidates that should be tried, and return the ids of their keyframes
-        (``match``). Candidates without a similarity are never chosen."""
-        config = self._config
-        min_similarity = config.min_similarity
-        if keyframe < self.state.resting_until:
-            min_similarity = max(min_similarity, config.retry_factor * self.state.failed_similarity)
-        known = [(one.similarity, one.match) for one in candidates if one.similarity is not None]
-        best = sorted(known, reverse=True)[: config.max_candidates]
-        return {match for similarity, match in best if similarity >= min_similarity}
-
-    def record(self, candidate: LoopCandidate, *, located: bool) -> None:
-        """Record the result of verifying a candidate with learned descriptors.
-
-        Args:
-            located: whether the verification found a pose, even if the loop was rejected
-                afterwards.
-        """
-        if located:
-            self.state = replace(self.state, resting_until=0)
-        else:
-            until = candidate.query + 1 + self._config.retry_interval
-            self.state = VerifierState(until, candidate.similarity or 0.0)
 
 
 def with_similarities(

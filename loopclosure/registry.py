@@ -118,7 +118,7 @@ def create_detector(
         weights: weights of a learned detector, or the vocabulary of ``bow``; None uses the file
             that vslam ships.
         images: the store of keyframe images from :func:`create_images`. Pass the same store to
-            ``verifier_for``.
+            ``Verifier``.
         late: whether loading of the shipped network is postponed until the first image.
 
     Raises:

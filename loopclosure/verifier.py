@@ -1,12 +1,11 @@
-"""Verifiers: they decide geometrically whether a loop candidate is a loop.
-
-There are three verifiers. The first uses ORB descriptors. The second uses learned descriptors. The
-third uses ORB descriptors first, and learned descriptors if ORB descriptors fail.
-"""
+"""Decides which loop candidates are verified, in which order and with which descriptors, and
+verifies them geometrically."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,6 @@ from vslam.camera import Camera
 from vslam.config import Config
 from vslam.loopclosure import verification
 from vslam.loopclosure.learned_verification import (
-    LearnedTrials,
     is_image_redundant,
     verify_learned,
     with_similarities,
@@ -26,153 +24,164 @@ from vslam.loops import LoopCandidate, LoopEdge
 from vslam.map import Map
 from vslam.states import VerifierState
 
+Descriptors = Literal["orb", "learned"]
+
+
+class Trial(NamedTuple):
+    """A loop candidate that is verified.
+
+    Attributes:
+        descriptors: the kinds of descriptors that are tried until one of them verifies the
+            candidate.
+        doubt: what already speaks against the candidate; empty if nothing does.
+    """
+
+    candidate: LoopCandidate
+    descriptors: tuple[Descriptors, ...]
+    doubt: str = ""
+
 
 class Verifier:
-    """Decides geometrically whether a keyframe shows the place that a loop detector proposes. This
-    class uses only ORB descriptors.
+    """Verifies loop candidates using ORB descriptors, learned descriptors, or both.
 
     The methods are called in the order of the keyframes, by one thread at a time.
 
     Attributes:
-        images: the store of keyframe images that verification needs; None if it needs no images.
+        images: the store of keyframe images that learned descriptors need; None if only ORB
+            descriptors are used.
+        descriptors: the kinds of descriptors, in the order in which they are tried.
         verified_memory: number of further keyframes during which a verified loop is kept while it
             waits for other loops that agree with it.
+        state: the last attempt with learned descriptors.
     """
 
-    images: KeyframeImages | None = None
+    def __init__(
+        self, config: Config, camera: Camera, images: KeyframeImages | None = None
+    ) -> None:
+        """Create the verifier that ``config.verification.descriptors`` selects.
 
-    def __init__(self, config: Config, camera: Camera) -> None:
+        Args:
+            images: the result of ``vslam.loopclosure.registry.create_images``. With None, only ORB
+                descriptors are used, regardless of the configuration.
+        """
+        self.images = images
+        self.descriptors: tuple[Descriptors, ...] = ("orb",)
         self.verified_memory = config.consistency.verified_memory
+        self.state = VerifierState()
         self._config = config
         self._camera = camera
+        if images is not None:
+            only = config.verification.descriptors == "learned"
+            self.descriptors = ("learned",) if only else ("orb", "learned")
+            self.verified_memory = max(self.verified_memory, config.learned.verified_memory)
 
     def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
         """Return whether the image of a keyframe is not needed, because other stored images show
         nearly the same view."""
-        return False
+        learned = self._config.learned
+        return self.images is not None and is_image_redundant(map_, keyframe, self.images, learned)
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
-        """Store the image of a new keyframe, if verification needs images.
+        """Store the image of a new keyframe if it is needed, and remove the images of keyframes
+        that were culled.
 
         Args:
             image: ``(H, W)`` uint8 left image; None if it is missing or not needed.
         """
-
-    def rate(
-        self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
-    ) -> list[LoopCandidate]:
-        """Set the fields ``similarity`` and ``promising`` of a keyframe's candidates, if this
-        verifier uses these fields. The order of the candidates is not changed."""
-        return candidates
-
-    def verify(
-        self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
-    ) -> LoopEdge:
-        """Decide whether a candidate is a loop. The map is not changed.
-
-        Args:
-            refusal: the rejected loop edge if the candidate has failed an earlier test, or else
-                None. Verification with ORB descriptors skips such a candidate.
-
-        Returns:
-            An accepted loop edge with a pose, or a rejected loop edge with the reason.
-        """
-        if refusal is not None:
-            return refusal
-        return verification.verify(map_, candidate, self._camera, self._config.verification)
-
-    def state(self) -> VerifierState:
-        """Return the state of the verifier without the images, to store it in a map file or a
-        checkpoint."""
-        return VerifierState()
-
-    def restore(self, state: VerifierState) -> None:
-        """Restore a state that the method ``state`` returned."""
-
-
-def verifier_for(config: Config, camera: Camera, images: KeyframeImages | None = None) -> Verifier:
-    """Create the verifier that ``config.verification.descriptors`` selects.
-
-    Args:
-        images: the store of keyframe images, from ``vslam.loopclosure.registry.create_images``.
-            None selects verification with only ORB descriptors, regardless of the configuration.
-    """
-    if images is None:
-        return Verifier(config, camera)
-    if config.verification.descriptors == "learned":
-        return LearnedVerifier(config, camera, images)
-    return OrbThenLearnedVerifier(config, camera, images)
-
-
-class LearnedVerifier(Verifier):
-    """A verifier that uses only learned local descriptors.
-
-    :class:`LearnedTrials` selects the promising candidates. A promising candidate is tried even if
-    only one keyframe resembled the place, because a camera that crosses a place at night may get
-    only one good view of the place.
-    """
-
-    images: KeyframeImages
-
-    def __init__(self, config: Config, camera: Camera, images: KeyframeImages) -> None:
-        super().__init__(config, camera)
-        self.images = images
-        self.verified_memory = max(self.verified_memory, config.learned.verified_memory)
-        self._trials = LearnedTrials(config.learned)
-
-    def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
-        return is_image_redundant(map_, keyframe, self.images, self._config.learned)
-
-    def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
-        """Store the image of a new keyframe, and remove the images of keyframes that were
-        culled."""
-        if image is not None:
+        if self.images is not None and image is not None:
             self.images.add(keyframe, image)
             self.images.keep(map_.arrays.keyframe_alive)
 
-    def rate(
-        self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
-    ) -> list[LoopCandidate]:
-        images, config = self.images, self._config
-        if keyframe in images and any(one.similarity is None for one in candidates):
-            beyond = beyond_reach(map_, keyframe, config.siamese)
-            glance = images.glance
-            candidates = with_similarities(
-                candidates, lambda: glance(keyframe), images, config.learned, beyond
-            )
-        chosen = self._trials.choose(keyframe, candidates)
-        return [replace(one, promising=one.match in chosen) for one in candidates]
+    def order(
+        self,
+        map_: Map,
+        keyframe: int,
+        candidates: list[LoopCandidate],
+        doubts: Mapping[int, str],
+    ) -> tuple[list[Trial], list[LoopEdge]]:
+        """Decide which candidates of a keyframe are verified, and how, in the order given.
 
-    def verify(
-        self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
-    ) -> LoopEdge:
-        """Decide whether a candidate is a loop. Promising candidates are tried even if they have
-        failed an earlier test. Other candidates are never tried."""
-        if not candidate.promising:
-            reason = "images not similar enough for learned verification"
-            return refusal or LoopEdge.of(candidate, reason, matched_by="learned")
-        config = self._config
-        edge = verify_learned(
-            map_, candidate, self.images, self._camera, config.learned, config.verification
-        )
-        located = edge.T_query_match is not None
-        self._trials.record(candidate, located=located)
-        if located or refusal is None:
-            return edge
-        return replace(refusal, reason=f"{refusal.reason}; {edge.reason}")
+        ORB descriptors are tried where nothing speaks against a candidate. Learned descriptors are
+        tried where the images are most similar. This is enough even if something speaks against
+        the candidate, because a camera that crosses a place at night may get only one good view.
 
-    def state(self) -> VerifierState:
-        return self._trials.state
+        Args:
+            candidates: the loop candidates, best first.
+            doubts: what speaks against some of them, by the id of their ``match``.
+
+        Returns:
+            The trials, and a rejected loop edge for each other candidate.
+        """
+        similar = self._most_similar(map_, keyframe, candidates)
+        trials, rejected = [], []
+        for one in candidates:
+            doubt, likeness = doubts.get(one.match, ""), similar.get(one.match)
+            fits = {"orb": not doubt, "learned": likeness is not None}
+            descriptors = tuple(kind for kind in self.descriptors if fits[kind])
+            if descriptors:
+                trials.append(Trial(replace(one, similarity=likeness), descriptors, doubt))
+            else:
+                unlike = "images not similar enough for learned verification"
+                rejected.append(LoopEdge.of(one, doubt or unlike))
+        return trials, rejected
+
+    def verify(self, map_: Map, trial: Trial) -> LoopEdge:
+        """Decide whether a candidate is a loop. The map is not changed.
+
+        Returns:
+            An accepted loop edge with a pose, or a rejected loop edge with all reasons.
+        """
+        edges: list[LoopEdge] = []
+        for kind in trial.descriptors:
+            edges.append(self._verified(map_, trial.candidate, kind))
+            if edges[-1].accepted:
+                return edges[-1]
+        reasons = [trial.doubt, *(edge.reason for edge in edges)]
+        best = max(edges, key=lambda edge: edge.n_inliers)
+        return replace(best, reason="; ".join(filter(None, reasons)))
 
     def restore(self, state: VerifierState) -> None:
-        self._trials.state = state
+        """Continue from the ``state`` of another verifier."""
+        self.state = state
 
+    def _verified(self, map_: Map, candidate: LoopCandidate, kind: Descriptors) -> LoopEdge:
+        camera, config = self._camera, self._config
+        if kind == "orb":
+            return verification.verify(map_, candidate, camera, config.verification)
+        assert self.images is not None
+        edge = verify_learned(
+            map_, candidate, self.images, camera, config.learned, config.verification
+        )
+        if edge.T_query_match is not None:
+            self.state = replace(self.state, resting_until=0)
+        else:
+            until = candidate.query + 1 + config.learned.retry_interval
+            self.state = VerifierState(until, candidate.similarity or 0.0)
+        return edge
 
-class OrbThenLearnedVerifier(LearnedVerifier):
-    """A verifier that uses ORB descriptors first, and learned descriptors if ORB fails."""
+    def _most_similar(
+        self, map_: Map, keyframe: int, candidates: list[LoopCandidate]
+    ) -> dict[int, float]:
+        """Choose the candidates for which learned descriptors are tried, by their ``match``, and
+        return their similarities.
 
-    def verify(
-        self, map_: Map, candidate: LoopCandidate, refusal: LoopEdge | None = None
-    ) -> LoopEdge:
-        edge = Verifier.verify(self, map_, candidate, refusal)
-        return edge if edge.accepted else super().verify(map_, candidate, edge)
+        Learned descriptors take forty times as long as ORB descriptors. Therefore, only the most
+        similar candidates are tried, and only if their similarity exceeds a limit. After a failed
+        attempt, the limit is higher for the next ``learned.retry_interval`` keyframes.
+        """
+        images, config = self.images, self._config.learned
+        if images is None:
+            return {}
+        if keyframe in images and any(one.similarity is None for one in candidates):
+            beyond = beyond_reach(map_, keyframe, self._config.siamese)
+            glance = images.glance
+            candidates = with_similarities(
+                candidates, lambda: glance(keyframe), images, config, beyond
+            )
+        least = config.min_similarity
+        if keyframe < self.state.resting_until:
+            least = max(least, config.retry_factor * self.state.failed_similarity)
+        known = {one.match: one.similarity for one in candidates if one.similarity is not None}
+        best = sorted(known, key=lambda match: (known[match], match), reverse=True)
+        return {match: known[match] for match in best[: config.max_candidates]
+                if known[match] >= least}  # fmt: skip

@@ -368,10 +368,10 @@ def two_keyframes():
     """Add a second keyframe, which tracks two landmarks of the first keyframe."""
     from vslam.closing import LoopClosing
     from vslam.loopclosure.detector import NoDetector
-    from vslam.loopclosure.verifier import verifier_for
+    from vslam.loopclosure.verifier import Verifier
 
     config = Config()
-    closing = LoopClosing(NoDetector(), verifier_for(config, CAMERA), CAMERA, config, threads=1)
+    closing = LoopClosing(NoDetector(), Verifier(config, CAMERA), CAMERA, config, threads=1)
     mapper = Mapper(CONTEXT, closing, Workers(1))
     first, second = (frame_of(extracted_at(100, 50, 0, 3), k, 0.1 * k) for k in range(2))
     mapper.record(first)

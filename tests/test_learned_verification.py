@@ -12,7 +12,6 @@ from vslam.features import Features
 from vslam.geometry import inverse, se3_exp, transform
 from vslam.loopclosure.learned_verification import (
     LearnedRelocalisation,
-    LearnedTrials,
     is_image_redundant,
     joined,
     recognise,
@@ -188,33 +187,6 @@ def test_pairs_join_without_repeating_a_feature_or_a_landmark():
     second = np.array([2, 3, 4], np.int32), np.array([30, 10, 40], np.int32)
     feature, landmark = joined(first, second)
     assert (feature.tolist(), landmark.tolist()) == ([1, 2, 4], [10, 20, 40])
-
-
-def test_only_what_looks_alike_is_tried_and_less_after_a_try_in_vain():
-    config = CONFIG.learned.model_copy(
-        update={
-            "min_similarity": 0.35,
-            "retry_factor": 1.1,
-            "retry_interval": 8,
-            "max_candidates": 2,
-        }
-    )
-    trials = LearnedTrials(config)
-
-    def candidates(*similarity: float | None) -> list[LoopCandidate]:
-        return [LoopCandidate(50, match, 0.9, one) for match, one in enumerate(similarity)]
-
-    assert trials.choose(50, candidates(0.34, None, 0.1)) == set()
-    assert trials.choose(50, candidates(0.35, None, 0.5, 0.6)) == {2, 3}
-    trials.record(candidates(0.4)[0], located=False)
-    assert trials.choose(58, candidates(0.43)) == set()
-    assert trials.choose(58, candidates(0.45)) == {0}
-    assert trials.choose(59, candidates(0.43)) == {0}
-    trials.record(candidates(0.4)[0], located=True)
-    assert trials.choose(51, candidates(0.36)) == {0}
-    # The smallest similarity that is tried does not decrease, although the last one was 0.1.
-    trials.record(candidates(0.1)[0], located=False)
-    assert trials.choose(52, candidates(0.3)) == set()
 
 
 def test_candidates_that_no_detector_compared_are_compared_where_the_camera_may_be(network):

@@ -42,7 +42,7 @@ from vslam.loopclosure.training.export import (
 )
 from vslam.loopclosure.training.preprocessing import to_tensor
 from vslam.loopclosure.training.siamese import for_inference, load_network
-from vslam.loopclosure.verifier import verifier_for
+from vslam.loopclosure.verifier import Verifier
 from vslam.loops import LastSeen
 from vslam.map import PREDICTED, UNPREDICTED, Map
 from vslam.map_kernels import link
@@ -470,7 +470,7 @@ def test_the_paper_s_detector_compares_with_all_keyframes_and_verifies_by_orb():
     detector, images = detector_with_images("capsule-paper", config)
     assert images is None  # local descriptors neither rerank nor verify
     camera = Camera(400.0, 400.0, 310.0, 94.0, 0.5, 620, 188)
-    verifier = verifier_for(config, camera, images)
+    verifier = Verifier(config, camera, images)
     closing = LoopClosing(detector, verifier, camera, config, threads=1)
     # According to odometry, the last keyframe is 700 m from the first one, but shows its place.
     map_ = driven([50.0 * k for k in range(15)])

@@ -13,19 +13,12 @@ from test_verification import street
 
 from vslam.config import VerificationConfig
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
-from vslam.loopclosure.verifier import (
-    LearnedVerifier,
-    OrbThenLearnedVerifier,
-    Verifier,
-    verifier_for,
-)
-from vslam.loops import LoopCandidate, LoopEdge
+from vslam.loopclosure.verifier import Trial, Verifier
+from vslam.loops import LoopCandidate
 from vslam.states import VerifierState
 
 PLAIN = LoopCandidate(1, 0, 0.9, similarity=0.5)
-PROMISING = replace(PLAIN, promising=True)
-REFUSAL = LoopEdge.of(PLAIN, "proposed for only 1 of the 3 consecutive keyframes needed")
-BOTH = (LearnedVerifier, OrbThenLearnedVerifier)
+DOUBT = "proposed for only 1 of the 3 consecutive keyframes needed"
 
 
 @pytest.fixture(scope="module")
@@ -48,124 +41,136 @@ def configured(descriptors: str):
 
 @pytest.mark.parametrize(
     ("descriptors", "expected"),
-    [
-        ("auto", OrbThenLearnedVerifier),
-        ("both", OrbThenLearnedVerifier),
-        ("learned", LearnedVerifier),
-    ],
+    [("auto", ("orb", "learned")), ("both", ("orb", "learned")), ("learned", ("learned",))],
 )
-def test_the_configuration_chooses_the_verifier(network, descriptors, expected):
+def test_the_configuration_chooses_the_descriptors(network, descriptors, expected):
     images, config = KeyframeImages(network), configured(descriptors)
-    assert type(verifier_for(config, CAMERA, images)) is expected
-    assert verifier_for(config, CAMERA, images).images is images
-    alone = verifier_for(config, CAMERA)
-    assert (type(alone), alone.images) == (Verifier, None)
+    verifier = Verifier(config, CAMERA, images)
+    assert (verifier.descriptors, verifier.images) == (expected, images)
+    alone = Verifier(config, CAMERA)
+    assert (alone.descriptors, alone.images) == (("orb",), None)
 
 
 def test_learned_descriptors_may_wait_longer_for_a_second_loop(network):
-    alone, learned = (
-        verifier_for(CONFIG, CAMERA),
-        verifier_for(CONFIG, CAMERA, KeyframeImages(network)),
-    )
+    alone, learned = Verifier(CONFIG, CAMERA), Verifier(CONFIG, CAMERA, KeyframeImages(network))
     assert alone.verified_memory == CONFIG.consistency.verified_memory
     assert learned.verified_memory == CONFIG.learned.verified_memory > alone.verified_memory
 
 
-def test_orb_verifies_a_candidate_unless_it_was_refused(by_night):
-    verifier, map_ = Verifier(CONFIG, STREET_CAMERA), street().map
-    candidate = LoopCandidate(6, 1, 0.5, promising=True)
-    edge = verifier.verify(map_, candidate)
-    assert (edge.accepted, edge.matched_by) == (True, "orb")
-    assert verifier.verify(map_, candidate, REFUSAL) is REFUSAL
-    assert "descriptors match" in Verifier(CONFIG, CAMERA).verify(by_night.map, PROMISING).reason
-
-
-def test_orb_needs_no_image_and_rates_nothing():
+def test_without_images_orb_verifies_what_nothing_speaks_against():
     verifier, map_ = Verifier(CONFIG, STREET_CAMERA), street().map
     verifier.add(map_, 6, np.zeros((192, 640), np.uint8))
     assert not verifier.is_image_redundant(map_, 7)
-    assert verifier.rate(map_, 6, [PLAIN]) == [PLAIN]
-    verifier.restore(VerifierState(5, 0.5))
-    assert verifier.state() == VerifierState()
-
-
-@pytest.mark.parametrize("kind", BOTH)
-@pytest.mark.parametrize("refusal", [None, REFUSAL])
-def test_a_promising_candidate_is_verified_by_learned_descriptors(by_night, kind, refusal):
-    verifier = kind(CONFIG, CAMERA, by_night.images)
-    edge = verifier.verify(by_night.map, PROMISING, refusal)
-    assert (edge.accepted, edge.matched_by) == (True, "learned")
-    assert verifier.state().resting_until == 0
-
-
-def test_learned_descriptors_alone_try_no_other_candidate(by_night):
-    verifier = LearnedVerifier(CONFIG, CAMERA, by_night.images)
-    edge = verifier.verify(by_night.map, PLAIN)
-    assert (edge.accepted, edge.reason) == (
-        False,
-        "images not similar enough for learned verification",
-    )
-    assert verifier.verify(by_night.map, PLAIN, REFUSAL) is REFUSAL
-
-
-def test_orb_comes_first_where_both_verify(network, by_night):
-    map_ = street().map
-    images = KeyframeImages(network)  # empty, so that learned descriptors verify nothing
-    verifier = OrbThenLearnedVerifier(CONFIG, STREET_CAMERA, images)
-    edge = verifier.verify(map_, LoopCandidate(6, 1, 0.5, promising=True))
+    good, bad = LoopCandidate(6, 1, 0.5), LoopCandidate(6, 2, 0.5)
+    (trial,), (rejected,) = verifier.order(map_, 6, [bad, good], {2: DOUBT})
+    assert trial == Trial(good, ("orb",))
+    assert (rejected.match, rejected.accepted, rejected.reason) == (2, False, DOUBT)
+    edge = verifier.verify(map_, trial)
     assert (edge.accepted, edge.matched_by) == (True, "orb")
-    refused = OrbThenLearnedVerifier(CONFIG, CAMERA, by_night.images).verify(by_night.map, PLAIN)
-    assert refused == Verifier(CONFIG, CAMERA).verify(by_night.map, PLAIN)
+    assert verifier.state == VerifierState()
 
 
 @pytest.mark.parametrize(
-    ("kind", "refusal", "reason"),
+    ("descriptors", "doubt", "expected"),
     [
-        (LearnedVerifier, None, "no image is stored"),
-        (LearnedVerifier, REFUSAL, f"{REFUSAL.reason}; no image is stored"),
-        (OrbThenLearnedVerifier, None, "only 0 descriptors match; no image is stored"),
-        (OrbThenLearnedVerifier, REFUSAL, f"{REFUSAL.reason}; no image is stored"),
+        ("learned", "", ("learned",)),
+        ("both", "", ("orb", "learned")),
+        ("both", DOUBT, ("learned",)),
+    ],
+)
+def test_similar_images_are_verified_by_learned_descriptors_in_spite_of_a_doubt(
+    by_night, descriptors, doubt, expected
+):
+    verifier = Verifier(configured(descriptors), CAMERA, by_night.images)
+    (trial,), rejected = verifier.order(by_night.map, 1, [PLAIN], {0: doubt} if doubt else {})
+    assert trial == Trial(PLAIN, expected, doubt)
+    assert rejected == []
+    edge = verifier.verify(by_night.map, trial)
+    assert (edge.accepted, edge.matched_by) == (True, "learned")
+    assert verifier.state.resting_until == 0
+
+
+def test_images_that_are_not_similar_are_left_to_orb(by_night):
+    unlike = replace(PLAIN, similarity=0.1)
+    learned = Verifier(configured("learned"), CAMERA, by_night.images)
+    trials, (rejected,) = learned.order(by_night.map, 1, [unlike], {})
+    assert trials == []
+    assert rejected.reason == "images not similar enough for learned verification"
+    both = Verifier(configured("both"), CAMERA, by_night.images)
+    ((_, descriptors, _),), _ = both.order(by_night.map, 1, [unlike], {})
+    assert descriptors == ("orb",)
+
+
+def test_orb_comes_first_where_both_verify(network):
+    map_ = street().map
+    images = KeyframeImages(network)  # empty, so that learned descriptors verify nothing
+    verifier = Verifier(CONFIG, STREET_CAMERA, images)
+    candidate = LoopCandidate(6, 1, 0.5, similarity=0.9)
+    edge = verifier.verify(map_, Trial(candidate, ("orb", "learned")))
+    assert (edge.accepted, edge.matched_by) == (True, "orb")
+
+
+@pytest.mark.parametrize(
+    ("trial", "reason"),
+    [
+        (Trial(PLAIN, ("learned",)), "no image is stored"),
+        (Trial(PLAIN, ("learned",), DOUBT), f"{DOUBT}; no image is stored"),
+        (Trial(PLAIN, ("orb", "learned")), "only 0 descriptors match; no image is stored"),
     ],
 )
 def test_a_failed_attempt_says_all_that_spoke_against_it_and_is_remembered(
-    network, by_night, kind, refusal, reason
+    network, by_night, trial, reason
 ):
-    verifier = kind(CONFIG, CAMERA, KeyframeImages(network))
-    edge = verifier.verify(by_night.map, PROMISING, refusal)
+    verifier = Verifier(CONFIG, CAMERA, KeyframeImages(network))
+    edge = verifier.verify(by_night.map, trial)
     assert (edge.accepted, edge.reason) == (False, reason)
-    expected = VerifierState(
-        PROMISING.query + 1 + CONFIG.learned.retry_interval, PROMISING.similarity
-    )
-    assert verifier.state() == expected
-    other = kind(CONFIG, CAMERA, KeyframeImages(network))
-    assert other.state() != expected
-    other.restore(verifier.state())
-    assert other.state() == expected
-    # It pauses, and so does the restored verifier.
-    again = LoopCandidate(2, 0, 0.9, similarity=PROMISING.similarity)
-    assert [one.rate(by_night.map, 2, [again]) for one in (verifier, other)] == [[again]] * 2
-    fresh = kind(CONFIG, CAMERA, KeyframeImages(network))
-    assert fresh.rate(by_night.map, 2, [again]) == [replace(again, promising=True)]
+    assert PLAIN.similarity is not None
+    until = PLAIN.query + 1 + CONFIG.learned.retry_interval
+    assert verifier.state == VerifierState(until, PLAIN.similarity)
+    again = LoopCandidate(2, 0, 0.9, similarity=PLAIN.similarity)
+    resting, _ = verifier.order(by_night.map, 2, [again], {0: DOUBT})
+    assert resting == []
+    fresh = Verifier(CONFIG, CAMERA, KeyframeImages(network))
+    (trial,), _ = fresh.order(by_night.map, 2, [again], {0: DOUBT})
+    assert trial.descriptors == ("learned",)
 
 
-@pytest.mark.parametrize("kind", BOTH)
-def test_candidates_are_rated_by_their_images_within_reach(network, by_night, kind):
+def test_only_the_most_similar_are_tried_and_fewer_after_a_failed_attempt(by_night):
+    least = {"min_similarity": 0.35, "retry_factor": 1.1, "retry_interval": 8, "max_candidates": 2}
+    learned = CONFIG.learned.model_copy(update=least)
+    config = configured("learned").model_copy(update={"learned": learned})
+    verifier = Verifier(config, CAMERA, by_night.images)
+
+    def tried(keyframe, *similarity):
+        candidates = [LoopCandidate(keyframe, k, 0.9, one) for k, one in enumerate(similarity)]
+        trials, _ = verifier.order(by_night.map, keyframe, candidates, {})
+        return {trial.candidate.match for trial in trials}
+
+    assert tried(50, 0.34, 0.1) == set()
+    assert tried(50, 0.35, 0.1, 0.5, 0.6) == {2, 3}
+    verifier.state = VerifierState(59, 0.4)
+    assert tried(58, 0.43) == set()
+    assert tried(58, 0.45) == tried(59, 0.43) == {0}
+    verifier.state = VerifierState(59, 0.1)  # the limit never falls below the usual one
+    assert tried(52, 0.3) == set()
+
+
+def test_candidates_are_compared_by_their_images_within_reach(network, by_night):
     siamese = CONFIG.siamese.model_copy(update={"monocular_reach_share": 1.0})
-    config = CONFIG.model_copy(update={"siamese": siamese})
+    config = configured("learned").model_copy(update={"siamese": siamese})
     unrated = LoopCandidate(1, 0, 0.9)
-    (rated,) = kind(config, CAMERA, by_night.images).rate(by_night.map, 1, [unrated])
-    assert rated.promising
-    assert rated.similarity >= CONFIG.learned.min_similarity
+    (trial,), _ = Verifier(config, CAMERA, by_night.images).order(by_night.map, 1, [unrated], {})
+    assert trial.candidate.similarity >= CONFIG.learned.min_similarity
     # The map has one straight step. By default, the place is then out of reach.
-    assert kind(CONFIG, CAMERA, by_night.images).rate(by_night.map, 1, [unrated]) == [unrated]
-    blind = kind(config, CAMERA, KeyframeImages(network))
-    assert blind.rate(by_night.map, 1, [unrated]) == [unrated]
+    near = Verifier(configured("learned"), CAMERA, by_night.images)
+    blind = Verifier(config, CAMERA, KeyframeImages(network))
+    for verifier in (near, blind):
+        assert verifier.order(by_night.map, 1, [unrated], {})[0] == []
 
 
-@pytest.mark.parametrize("kind", BOTH)
-def test_images_are_kept_while_their_keyframes_live(network, kind):
+def test_images_are_kept_while_their_keyframes_live(network):
     map_ = street().map
-    verifier = kind(CONFIG, STREET_CAMERA, KeyframeImages(network))
+    verifier = Verifier(CONFIG, STREET_CAMERA, KeyframeImages(network))
     image = cv2.GaussianBlur(
         np.random.default_rng(0).integers(0, 256, (192, 640), np.uint8), (0, 0), 2
     )

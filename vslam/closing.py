@@ -114,28 +114,24 @@ class LoopClosing:
 
     def _find(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> LoopSearch:
         """Verify loop candidates, best first, until a candidate passes. The map is only read."""
-        candidates = self.verifier.rate(map_, keyframe, candidates)
-        _, rejected = self._consistency.update(candidates, map_)
-        rejections = {edge.match: edge for edge in rejected}
-        tried = [one for one in candidates if one.promising or one.match not in rejections]
-        matches = {one.match for one in tried}
-        edges = [edge for edge in rejected if edge.match not in matches]
-        for number, candidate in enumerate(tried):
-            edge = self.verifier.verify(map_, candidate, rejections.get(candidate.match))
-            edge = self._consistency.confirm(edge, map_)
+        _, unrepeated = self._consistency.update(candidates, map_)
+        doubts = {edge.match: edge.reason for edge in unrepeated}
+        trials, edges = self.verifier.order(map_, keyframe, candidates, doubts)
+        for number, trial in enumerate(trials):
+            edge = self._consistency.confirm(self.verifier.verify(map_, trial), map_)
             loop = None
             if edge.accepted:
                 edge, loop = self._solve(map_, edge)
             edges.append(edge)
             if loop is not None:
-                edges += [_superseded(other) for other in tried[number + 1 :]]
+                edges += [_superseded(other.candidate) for other in trials[number + 1 :]]
                 return LoopSearch(edges, loop)
         return LoopSearch(edges)
 
     def state(self) -> ClosingState:
         """Return the state for a checkpoint, without the loop detector and the images."""
         return ClosingState(
-            self._consistency.state(), self.verifier.state(), self._followed, self._new_revisits
+            self._consistency.state(), self.verifier.state, self._followed, self._new_revisits
         )
 
     def restore(self, state: ClosingState) -> None:

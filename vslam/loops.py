@@ -26,7 +26,6 @@ class LoopCandidate:
             similarity was not computed.
         proposed_by: name of the detector that proposed the candidate. Several names are joined by
             ``+``.
-        promising: whether the candidate is verified even if the consistency test rejects it.
     """
 
     query: int
@@ -34,7 +33,6 @@ class LoopCandidate:
     score: float
     similarity: float | None = None
     proposed_by: str = ""
-    promising: bool = False
 
 
 class Localisation(NamedTuple):

@@ -20,7 +20,7 @@ from vslam.config import Config
 from vslam.features import Features
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.loopclosure.verifier import verifier_for
+from vslam.loopclosure.verifier import Verifier
 from vslam.loops import LoopCandidate, LoopEdge
 from vslam.map import Map
 from vslam.maps.stored_map import StoredMap, appended
@@ -111,7 +111,7 @@ def join(
     if images is not None and both.images is not None:
         images.restore(both.images, one.camera.width)
     # With threads=1, global bundle adjustment runs only in finish(), after the last loop.
-    verifier = verifier_for(config, one.camera, images)
+    verifier = Verifier(config, one.camera, images)
     closing = LoopClosing(detector, verifier, one.camera, config, threads=1)
     closing.closed.extend(both.loops)
     map_, n = both.map, one.map.n_keyframes

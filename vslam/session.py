@@ -25,7 +25,7 @@ from vslam.geometry import inverse, orthonormalised, se3_log
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_verification import LearnedRelocalisation
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.loopclosure.verifier import verifier_for
+from vslam.loopclosure.verifier import Verifier
 from vslam.machine import StageClock
 from vslam.map import Map
 from vslam.mapping import Mapper
@@ -139,7 +139,7 @@ class Session:
             ValueError: the map cannot be continued. The message gives the reason in a few words.
         """
         camera, config = context.camera, context.config
-        verifier = verifier_for(config, camera, images)
+        verifier = Verifier(config, camera, images)
         self.closing = closing = LoopClosing(
             detector, verifier, camera, config, threads=workers.threads
         )

@@ -66,7 +66,7 @@ from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.detector import NoDetector
 from vslam.loopclosure.local_matching import DescriptorMaps, locate, locate_near, match_coarse
 from vslam.loopclosure.verification import verify
-from vslam.loopclosure.verifier import verifier_for
+from vslam.loopclosure.verifier import Verifier
 from vslam.loopclosure.vocabulary import Vocabulary, from_children
 from vslam.loops import LoopCandidate, LoopEdge
 from vslam.machine import available_cores
@@ -243,7 +243,7 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
         The map and the features of the last keyframe.
     """
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
-    verifier = verifier_for(config, CAMERA)
+    verifier = Verifier(config, CAMERA)
     closing = LoopClosing(NoDetector(), verifier, CAMERA, config, threads=1)
     context = Context.create(CAMERA, config)
     mapper = Mapper(context, closing, Workers(1))

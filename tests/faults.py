@@ -85,7 +85,7 @@ LATER = ("report.json", "report.md", "report.html", "figures")  # written after 
 POINTS = (
     Point("a frame's track", "vslam.frontend.tracker.Tracker.track", 200, EARLY),
     Point("keyframe policy", "vslam.modes.Building.update_map", 200, EARLY),
-    Point("publishing a keyframe", "vslam.mapping.Mapper._renew_view", 8, EARLY),
+    Point("publishing a keyframe", "vslam.published_map.PublishedMap._renew_view", 8, EARLY),
     Point("place detector, locate", "ring.Oracle.locate", 2, EARLY),
     Point("place detector, add", "ring.Oracle.add", 12, ON),
     Point("place detector, query", "ring.Oracle.query", 12, ON),
@@ -116,7 +116,7 @@ POINTS = (
     Point("moments", "vslam.run.moments._moment", 12, ON),
     Point("loop pictures", "vslam.run.moments.loop_matches", 1, ON),
     Point("closing the map", "vslam.closing.LoopClosing.conclude", 1, MAPLESS),
-    Point("final trajectory", "vslam.mapping.Mapper.trajectory", 1, EARLY),
+    Point("final trajectory", "vslam.published_map.PublishedMap.trajectory", 1, EARLY),
     Point("check of the rig", "vslam.run.pipeline.measure_offset", 1, ON),
     Point("result: KITTI poses", "vslam.report.folder.write_kitti", 1, MISSING,
           ("trajectory_kitti.txt",)),

@@ -46,7 +46,7 @@ STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("track the previous frame", (("vslam.frontend.tracker", "Tracker._track_previous_frame"),)),
     ("track the local map", (("vslam.frontend.tracker", "Tracker.track_features"),)),
     ("insert keyframes", (("vslam.mapping", "Mapper.insert"),)),
-    ("view of the map", (("vslam.mapping", "Mapper.refer_to"),)),
+    ("view of the map", (("vslam.published_map", "PublishedMap.refer_to"),)),
     ("triangulation", (("vslam.backend.local_mapping", "triangulate_with_neighbours"),)),
     ("fusion", (("vslam.backend.local_mapping", "fuse_neighbourhood"),)),
     ("local bundle adjustment", (("vslam.backend.local_mapping", "adjust_locally"),)),
@@ -60,7 +60,7 @@ STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
             ("vslam.closing", "LoopClosing.finish"),
         ),
     ),
-    ("publish", (("vslam.mapping", "Mapper.publish"),)),
+    ("publish", (("vslam.published_map", "PublishedMap.publish"),)),
     ("frame loop, the rest", (("vslam.run.pipeline", "run_sequence"),)),
     ("results", (("vslam.report.folder", "write_results"),)),
 )

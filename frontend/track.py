@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from vslam.camera import Image
 from vslam.features import Extracted, Features, Keypoints, Pyramid, TrackingState
 from vslam.frontend.masks import Mask
+from vslam.frontend.motion_time import motion_seconds
 from vslam.frontend.sides import Sides
 from vslam.geometry import Matrix
 from vslam.loops import LastSeen
@@ -221,7 +222,7 @@ class Prediction:
         lost_frames: number of frames that have been lost since the last one was tracked.
         is_resumed: whether the camera continues from the end of an earlier drive.
         seconds: duration of the motion since the frame before (``motion_seconds``).
-        interval: the same for the frame before; 0 if it is unknown.
+        times: ``(N,)`` timestamps of the frames before, in seconds (at most ``RECENT``).
     """
 
     index: int
@@ -232,7 +233,12 @@ class Prediction:
     lost_frames: int = 0
     is_resumed: bool = False
     seconds: float = 0.0
-    interval: float = 0.0
+    times: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def interval(self) -> float:
+        """Duration of the motion between the last two frames before; 0 if it is unknown."""
+        return motion_seconds(self.times) if len(self.times) > 1 else 0.0
 
     @property
     def is_tracking(self) -> bool:

@@ -59,13 +59,11 @@ class Motion:
         """
         twist = self._resumed_twist if last is None else last.twist
         times = self._frames.recent_timestamps(RECENT)
-        T_cw, seconds, interval = view.T_reference, 0.0, 0.0
+        T_cw, seconds = view.T_reference, 0.0
         if len(times):
             T_cw, seconds = self._frames.pose(-1), motion_seconds(np.append(times, timestamp))
             if twist is not None:
                 T_cw = orthonormalised(se3_exp(twist * seconds) @ T_cw)
-        if len(times) > 1:
-            interval = motion_seconds(times)
         return Prediction(
             len(self._frames),
             timestamp,
@@ -75,7 +73,7 @@ class Motion:
             self.lost_frames,
             self._is_resumed,
             seconds,
-            interval,
+            times,
         )
 
     def advance(self, track: Track, predicted: Prediction, view: MapView) -> Track:

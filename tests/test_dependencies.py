@@ -1,4 +1,4 @@
-"""Which module may import which (docs/explanation/design.md, section 2), read from the source.
+"""Which module may import which, read from the source (docs/explanation/design.md).
 
 Every folder and module has a level. A module may import modules of its own level and of lower
 levels. There are no circular imports. A few libraries may only be imported in one place each.

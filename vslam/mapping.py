@@ -142,8 +142,9 @@ class Mapper(PublishedMap):
         """
         if self._closing.is_adjusting or not map_.many_culled_landmarks:
             return track
-        new_id = map_.drop_culled_landmarks()
-        return replace(track, landmark=np.where(track.landmark >= 0, new_id[track.landmark], -1))
+        new_id, landmark = map_.drop_culled_landmarks(), track.landmark.copy()
+        landmark[track.landmark >= 0] = new_id[track.tracked]
+        return replace(track, landmark=landmark)
 
     def _set_newest(self, keyframe: int, track: Track) -> Track:
         map_ = self.map

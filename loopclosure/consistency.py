@@ -98,13 +98,9 @@ class LoopConsistency:
             return edge
         oldest = self._turn - self.config.verified_memory
         self._verified = [(turn, e) for turn, e in self._verified if turn >= oldest]
-        agreeing = [
-            other.p_wrong
-            for _, other in self._verified
-            if other.query != edge.query and self.agree(edge, other, map_)
-        ]
+        p_other = self._p_agreeing(edge, map_)
         self._verified.append((self._turn, edge))
-        return self._decided(edge, min(agreeing, default=1.0), self.config.max_wrong)
+        return self._decided(edge, p_other, self.config.max_wrong)
 
     def decided_at_end(
         self, map_: Map, camera: Camera, config: VerificationConfig
@@ -127,12 +123,14 @@ class LoopConsistency:
         for waiting in [edge for turn, edge in reversed(self._verified) if turn >= oldest]:
             if not map_.arrays.keyframe_alive[[waiting.query, waiting.match]].all():
                 continue
-            edge, limit = verify_near(map_, waiting, camera, config), self.config.max_wrong_at_end
+            p_other, limit = self._p_agreeing(waiting, map_), self.config.max_wrong_at_end
+            edge = verify_near(map_, waiting, camera, config)
             if edge.accepted:
-                edge = self._decided(edge, self._p_earlier(edge, map_, camera, config), limit)
+                p_earlier = self._p_earlier(edge, map_, camera, config)
+                edge = self._decided(edge, min(p_other, p_earlier), limit)
             if not edge.accepted:  # the matches that it had may have been culled
                 edge = replace(waiting, features=nothing, landmarks=nothing)
-                edge = self._decided(edge, 1.0, limit)
+                edge = self._decided(edge, p_other, limit)
             if edge.accepted:
                 yield edge
 
@@ -143,8 +141,18 @@ class LoopConsistency:
         edge = replace(edge, p_wrong=p_wrong)
         if p_wrong <= max_wrong:
             return edge
-        reason = f"verified, but wrong with probability {p_wrong:.2g}; no keyframe confirms it"
+        reason = f"verified, but wrong with probability {p_wrong:.2g}"
         return replace(edge, accepted=False, reason=reason)
+
+    def _p_agreeing(self, edge: LoopEdge, map_: Map) -> float:
+        """Return the probability that the best recent loop of another keyframe that agrees with
+        ``edge`` is wrong. It is 1 if no loop agrees."""
+        agreeing = [
+            other.p_wrong
+            for _, other in self._verified
+            if other.query != edge.query and self.agree(edge, other, map_)
+        ]
+        return min(agreeing, default=1.0)
 
     def _p_earlier(
         self, edge: LoopEdge, map_: Map, camera: Camera, config: VerificationConfig

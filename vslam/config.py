@@ -532,7 +532,7 @@ class ConsistencyConfig(Section):
     min_shared: int = Field(30, ge=1)
     """Keyframes that share at least this many landmarks with a candidate belong to the same place.
     [own]"""
-    max_wrong: float = Field(1e-3, gt=0, le=0.5)
+    max_wrong: float = Field(3e-3, gt=0, le=0.5)
     """A loop is closed only if the probability that it is wrong is at most this value, according to
     its own evidence and that of a loop that agrees with it. [own]"""
     max_wrong_at_end: float = Field(1e-2, gt=0, le=0.5)

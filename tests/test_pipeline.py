@@ -32,7 +32,7 @@ from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
-from vslam.run.pipeline import _record_loops, run_sequence
+from vslam.run.pipeline import _record_loops, mistracked_warnings, run_sequence
 from vslam.run.preparation import prepare_frame
 from vslam.run.recorder import Recorder
 from vslam.trajectory import Trajectory, read_kitti_poses
@@ -351,3 +351,13 @@ def test_kitti_00_is_as_good_as_orb_slam3():
     assert evaluation.t_rel_percent <= 1.5
     alone = run(KITTI, "00", max_frames=216, threads=1)
     assert alone.trajectory.T_wc.tobytes() == outcome.trajectory.T_wc.tobytes()
+
+
+def test_a_loop_closed_against_the_odometry_warns_of_the_frames_between_its_ends():
+    sound, against = (
+        LoopEdge(9, 2, 0.9, True, "closed", against_odometry=x) for x in (False, True)
+    )
+    frames = np.arange(10) * 7
+    assert mistracked_warnings([sound], frames) == []
+    (warning,) = mistracked_warnings([sound, against], frames)
+    assert warning.startswith("Tracking went wrong between frames 14 and 63")

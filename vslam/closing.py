@@ -40,8 +40,6 @@ from vslam.map_kernels import cut_path
 from vslam.plugins import reason
 from vslam.states import ClosingState
 
-MISTRACKED = "closed against the odometry"  # how the reason of such a loop begins
-
 _log = logging.getLogger(__name__)
 
 
@@ -246,13 +244,13 @@ class LoopClosing:
         solution = self._solution(map_, edge, Hypothesis.PREDICTED)
         if not solution.verdict.consistent and solution.has_gaps:
             solution = self._solution(map_, edge, Hypothesis.KIDNAPPED)
-        reason = "closed"
-        if not solution.verdict.consistent and edge.p_wrong <= self._config.loops.overwhelming:
-            reason = f"{MISTRACKED}: {solution.verdict.reason}"
+        refused, certain = solution.verdict.reason, self._config.loops.overwhelming
+        against = not solution.verdict.consistent and edge.p_wrong <= certain
+        if against:
             solution = self._solution(map_, edge, Hypothesis.MISTRACKED)
         if not solution.verdict.consistent:
-            return replace(edge, accepted=False, reason=solution.verdict.reason), None
-        closed = replace(edge, reason=reason)
+            return replace(edge, accepted=False, reason=refused), None
+        closed = replace(edge, reason="closed", against_odometry=against)
         return closed, _Loop(closed, solution, start)
 
     def _close(self, map_: Map, loop: _Loop) -> None:

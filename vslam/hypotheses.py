@@ -49,8 +49,8 @@ class Hypothesis(Enum):
 
 
 WEAK_PLACE = 0.3  # fraction of the shared landmarks that are usual in the map
-# Standard deviations of doubtful edges under ``MISTRACKED``: metres and radians.
-MISTRACKED = np.array([100.0, 100.0, 100.0, 1.0, 1.0, 1.0])
+# Standard deviations of the odometry across a weak place: metres and radians.
+DOUBTFUL_SIGMAS = np.array([100.0, 100.0, 100.0, 1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def _without_odometry(graph: PoseGraph, places: NDArray[np.int64]) -> PoseGraph:
     first, second = graph.keyframes[graph.edges].T
     crosses = np.searchsorted(places, second, "right") > np.searchsorted(places, first, "right")
     doubtful = crosses & np.isin(graph.kind, (TREE, COVISIBLE))
-    return replace(graph, sigmas=np.where(doubtful[:, None], MISTRACKED, graph.sigmas))
+    return replace(graph, sigmas=np.where(doubtful[:, None], DOUBTFUL_SIGMAS, graph.sigmas))
 
 
 def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:

@@ -113,6 +113,7 @@ class LoopEdge:
         matched_by: the kind of descriptors that were matched, "orb" or "learned".
         evidence: what verification found. None if it did not get as far as a pose with enough
             inliers.
+        against_odometry: whether the loop was closed although it contradicts the odometry.
         p_wrong: probability that the edge is wrong, from the evidence of its verification and, once
             another keyframe confirms it, of the other edge. It is 1 without evidence.
     """
@@ -132,6 +133,7 @@ class LoopEdge:
     matched_by: Literal["orb", "learned"] = "orb"
     proposed_by: str = ""
     evidence: LoopEvidence | None = None
+    against_odometry: bool = False
     p_wrong: float = 1.0
 
     @classmethod

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.camera import Camera, same_camera
-from vslam.closing import MISTRACKED
 from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.times import jitter_warnings
@@ -356,7 +355,7 @@ def _with_map(outcome: RunOutcome, run: _Run) -> RunOutcome:
             *slam.problems,
             *rig_warnings(slam.rig.sides),
             *_map_warnings(slam, source.camera),
-            *_mistracked_warnings(loops, keyframe_frames),
+            *mistracked_warnings(loops, keyframe_frames),
         ],
         n_keyframes=len(slam.map.living_keyframes()),
         n_landmarks=len(slam.map.living_landmarks()),
@@ -395,13 +394,18 @@ def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
         return [f"The rig could not be checked ({reason(error)})."]
 
 
-def _mistracked_warnings(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[str]:
+def mistracked_warnings(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[str]:
+    """Warn of the frames between the ends of each loop that was closed against the odometry.
+
+    Args:
+        frames: index of the frame of each keyframe.
+    """
     return [
         f"Tracking went wrong between frames {frames[loop.match]} and {frames[loop.query]}: they "
         "certainly show the same place, but the tracked motion between them does not lead there. "
         "The poses of the frames between them were corrected, but should not be trusted."
         for loop in loops
-        if loop.accepted and loop.reason.startswith(MISTRACKED)
+        if loop.against_odometry
     ]
 
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.kernels import inner_kernel, kernel, popcount
+from vslam.support.kernels import inner_kernel, kernel, popcount
 
 BLOCK = 6
 

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.geometry import compose, orthonormalised, se3_exp
-from vslam.kernels import inner_kernel, kernel
-from vslam.reprojection import chi_square, residual, unpacked
+from vslam.support.kernels import inner_kernel, kernel
+from vslam.types.geometry import compose, orthonormalised, se3_exp
+from vslam.types.reprojection import chi_square, residual, unpacked
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,11 @@ import numpy as np
 
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.local_mapping import adjust_locally, assemble, map_keyframe
-from vslam.camera import Camera
 from vslam.config import Config, StereoConfig
-from vslam.features import shifted_columns
-from vslam.map import Map
-from vslam.map_kernels import collect_landmarks
+from vslam.types.camera import Camera
+from vslam.types.features import shifted_columns
+from vslam.types.map import Map
+from vslam.types.map_kernels import collect_landmarks
 
 STEP = 0.2  # pixels between the three offsets for which the cost is computed
 ITERATIONS = 15

@@ -6,14 +6,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.config import Config
-from vslam.features import CELL, FeatureGrid
-from vslam.kernels import hamming, kernel
-from vslam.loops import LoopEdge
-from vslam.map import Map
-from vslam.map_kernels import collect_landmarks, link, merge_landmarks, observed_by, predict_octave
-from vslam.reprojection import chi_square_ratio, unpacked
+from vslam.support.kernels import hamming, kernel
+from vslam.types.camera import Camera
+from vslam.types.features import CELL, FeatureGrid
+from vslam.types.loops import LoopEdge
+from vslam.types.map import Map
+from vslam.types.map_kernels import (
+    collect_landmarks,
+    link,
+    merge_landmarks,
+    observed_by,
+    predict_octave,
+)
+from vslam.types.reprojection import chi_square_ratio, unpacked
 
 
 def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:

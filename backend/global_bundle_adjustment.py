@@ -24,7 +24,7 @@ from vslam.backend.bundle_adjustment import (
     step_cameras,
     step_points,
 )
-from vslam.kernels import inner_kernel, kernel
+from vslam.support.kernels import inner_kernel, kernel
 
 
 def adjust_globally(

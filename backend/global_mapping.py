@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from vslam.backend.bundle_adjustment import BundleProblem, BundleSolution
 from vslam.backend.local_mapping import assemble
 from vslam.backend.loop_correction import carry_landmarks
-from vslam.camera import DISPARITY_WEIGHT, Camera
-from vslam.geometry import compose, inverse, orthonormalised
-from vslam.kernels import kernel
-from vslam.map import Map
-from vslam.map_kernels import refresh_landmarks, resolve, unlink
+from vslam.support.kernels import kernel
+from vslam.types.camera import DISPARITY_WEIGHT, Camera
+from vslam.types.geometry import compose, inverse, orthonormalised
+from vslam.types.map import Map
+from vslam.types.map_kernels import refresh_landmarks, resolve, unlink
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,8 @@ from vslam.backend.pose_graph import (
 )
 from vslam.backend.similarity_graph import scale_of
 from vslam.config import PoseGraphConfig
-from vslam.errors import InputError
-from vslam.geometry import inverses
+from vslam.support.errors import InputError
+from vslam.types.geometry import inverses
 
 CORRELATION_S = 10.0  # docs/research/gps.md compares other values
 GATE = 11.34  # chi-square with three degrees of freedom that 1 % of correct fixes exceed

@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.fusion import fuse_neighbourhood
 from vslam.backend.triangulation import triangulate_with_neighbours
-from vslam.camera import DISPARITY_WEIGHT, Camera
 from vslam.config import Config
-from vslam.kernels import kernel
-from vslam.map import Map
-from vslam.map_kernels import (
+from vslam.support.kernels import kernel
+from vslam.types.camera import DISPARITY_WEIGHT, Camera
+from vslam.types.map import Map
+from vslam.types.map_kernels import (
     erase_landmark,
     gather_observations,
     refresh_landmarks,
     unlink,
 )
-from vslam.reprojection import stack_uvr
+from vslam.types.reprojection import stack_uvr
 
 RECENT_KEYFRAMES = 3  # how long a landmark is on probation, in keyframes (ORB-SLAM, VI-B)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.geometry import compose, inverse
-from vslam.kernels import inner_kernel, kernel
-from vslam.map import Map
+from vslam.support.kernels import inner_kernel, kernel
+from vslam.types.geometry import compose, inverse
+from vslam.types.map import Map
 
 
 def move_keyframes(

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import PoseGraphConfig
-from vslam.geometry import compose, inverse, inverses, se3_log
-from vslam.kernels import kernel
-from vslam.loops import LoopEdge, reversed_loop
-from vslam.map import Map, loop_of_living
-from vslam.map_kernels import covisible_pairs
+from vslam.support.kernels import kernel
+from vslam.types.geometry import compose, inverse, inverses, se3_log
+from vslam.types.loops import LoopEdge, reversed_loop
+from vslam.types.map import Map, loop_of_living
+from vslam.types.map_kernels import covisible_pairs
 
 TREE, COVISIBLE, WEAK, LOOP, GAP = range(5)  # kinds of edges, see ``essential_graph``
 ROTATION_FIRST = [3, 4, 5, 0, 1, 2]  # the order of GTSAM

@@ -27,10 +27,10 @@ from vslam.backend.pose_graph import (
     optimised_values,
 )
 from vslam.config import PoseGraphConfig
-from vslam.geometry import Matrix, inverses, se3_log
-from vslam.loops import LoopEdge, scaled_loop
-from vslam.map import Map
-from vslam.map_kernels import refresh_landmarks
+from vslam.types.geometry import Matrix, inverses, se3_log
+from vslam.types.loops import LoopEdge, scaled_loop
+from vslam.types.map import Map
+from vslam.types.map_kernels import refresh_landmarks
 
 
 def similarity(T_a_b: Matrix, scale: NDArray[np.float64] | float) -> Matrix:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.config import Config
-from vslam.geometry import inverse, transform
-from vslam.kernels import hamming, inner_kernel, kernel
-from vslam.map import NONE, Map
-from vslam.map_kernels import link_many
-from vslam.reprojection import chi_square_ratio, unpacked
+from vslam.support.kernels import hamming, inner_kernel, kernel
+from vslam.types.camera import Camera
+from vslam.types.geometry import inverse, transform
+from vslam.types.map import NONE, Map
+from vslam.types.map_kernels import link_many
+from vslam.types.reprojection import chi_square_ratio, unpacked
 
 EPIPOLAR_CHI2 = 3.84  # 95 % quantile with 1 degree of freedom
 SECTIONS = 512  # number of bins for the direction of an epipolar plane

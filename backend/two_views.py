@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
-from vslam.camera import Camera
-from vslam.geometry import Matrix
-from vslam.reprojection import stack_uvr
+from vslam.types.camera import Camera
+from vslam.types.geometry import Matrix
+from vslam.types.reprojection import stack_uvr
 
 ITERATIONS = 20
 

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import AlignmentConfig
-from vslam.features import PATCH_RADIUS, PATCH_SIDE, LandmarkPatches, Pyramid
 from vslam.frontend.patches import patches_around
 from vslam.frontend.track import Track
-from vslam.kernels import inner_kernel, kernel
+from vslam.support.kernels import inner_kernel, kernel
+from vslam.types.features import PATCH_RADIUS, PATCH_SIDE, LandmarkPatches, Pyramid
 
 HALF = 4  # half width of the compared window, pixels
 SIDE = 2 * HALF + 1

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vslam.kernels import inline, inner_kernel, kernel, trailing_zeros
+from vslam.support.kernels import inline, inner_kernel, kernel, trailing_zeros
 
 
 @kernel

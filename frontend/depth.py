@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.config import DepthConfig
-from vslam.kernels import kernel
+from vslam.support.kernels import kernel
+from vslam.types.camera import Camera
 
 
 def columns_of_depth(

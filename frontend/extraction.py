@@ -9,10 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import DepthImage, Image, ImageMap, check_images, check_mask
-from vslam.context import Context
-from vslam.errors import UnreadableImageError
-from vslam.features import Extracted, Features, Keypoints, Pyramid
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.masks import Mask
 from vslam.frontend.orb import Extraction, build_pyramid, extract_at
@@ -20,7 +16,11 @@ from vslam.frontend.pose_alignment import coarse_levels
 from vslam.frontend.sides import Sides, balanced, compare_sides
 from vslam.frontend.stereo import StereoMatches, inliers_only, match_stereo
 from vslam.frontend.weak_images import extract_in_any_light
-from vslam.workers import Job, Urgency, Workers
+from vslam.support.errors import UnreadableImageError
+from vslam.support.workers import Job, Urgency, Workers
+from vslam.types.camera import DepthImage, Image, ImageMap, check_images, check_mask
+from vslam.types.context import Context
+from vslam.types.features import Extracted, Features, Keypoints, Pyramid
 
 
 class Corners(NamedTuple):

@@ -19,13 +19,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.config import InitializationConfig
-from vslam.context import Context
-from vslam.features import Features
 from vslam.frontend.matching import Projections, Searchable, consistent_orientation, search_windows
-from vslam.geometry import Matrix
-from vslam.reprojection import CHI2_MONO, stack_uvr
+from vslam.types.camera import Camera
+from vslam.types.context import Context
+from vslam.types.features import Features
+from vslam.types.geometry import Matrix
+from vslam.types.reprojection import CHI2_MONO, stack_uvr
 
 CHI2_LINE = 3.841  # 95 % quantile of chi-square with 1 degree of freedom: distance from a line
 # Matches per sample. The eight-point algorithm needs all of them; a homography needs only four.

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vslam.config import KeyframeConfig
-from vslam.context import Context
 from vslam.frontend.track import Track
 from vslam.frontend.tracking import feature_depth
-from vslam.geometry import transform
-from vslam.map_view import MapView
-from vslam.states import PolicyState
+from vslam.types.context import Context
+from vslam.types.geometry import transform
+from vslam.types.map_view import MapView
+from vslam.types.states import PolicyState
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Image
 from vslam.config import OrbConfig
-from vslam.features import Pyramid
 from vslam.frontend.orb import build_pyramid
+from vslam.types.camera import Image
+from vslam.types.features import Pyramid
 
 # Least distance between a feature and a masked pixel, in pixels of the feature's level. Corner
 # detection and alignment read no pixels that are farther from the feature, so the edge of the mask

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import CELL, FeatureGrid, Features
-from vslam.kernels import hamming, kernel
-from vslam.map_kernels import predict_octave
+from vslam.support.kernels import hamming, kernel
+from vslam.types.features import CELL, FeatureGrid, Features
+from vslam.types.map_kernels import predict_octave
 
 ORIENTATION_BINS = 30
 

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import OrbConfig
-from vslam.context import scale_factors
-from vslam.features import Pyramid, level_of
 from vslam.frontend.corners import fast_scores, local_maxima, spread
-from vslam.kernels import borrowed, inner_kernel, kernel
+from vslam.support.kernels import borrowed, inner_kernel, kernel
+from vslam.types.context import scale_factors
+from vslam.types.features import Pyramid, level_of
 
 # Radius of the disc for the intensity centroid, pixels (Rublee et al., section 3.2).
 PATCH_RADIUS = 15
@@ -33,7 +33,8 @@ PATTERN: NDArray[np.int8] = np.load(Path(__file__).with_name("orb_pattern.npy"))
 
 @dataclass(frozen=True)
 class Extraction:
-    """Features of one image, sorted by octave. ``vslam.features.Features`` describes the fields.
+    """Features of one image, sorted by octave. ``Features`` (vslam/types/features.py) describes the
+    fields.
 
     At every pyramid level, coordinate 0 is the centre of the first pixel. If the image is ``w``
     times wider than a level, column x of the level corresponds to column ``(x + 0.5) w - 0.5`` of
@@ -207,7 +208,7 @@ def extract_levels(
             BRIEF test.
 
     Returns:
-        ``xy``, ``octave``, ``angle`` and ``descriptors``, see ``vslam.features.Features``.
+        ``xy``, ``octave``, ``angle`` and ``descriptors``, see ``vslam.types.features.Features``.
     """
     capacity = quota.sum()
     xy, octave = np.empty((capacity, 2), np.float32), np.empty(capacity, np.uint8)

@@ -14,16 +14,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.context import Context
-from vslam.features import PATCH_RADIUS, Features, Pyramid
 from vslam.frontend.alignment import find_patches
 from vslam.frontend.masks import Mask
 from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
 from vslam.frontend.standstill import MEASURE_SHARE, is_small, still_stands
 from vslam.frontend.tracking import predict_landmarks, trusted_landmarks
-from vslam.geometry import Matrix, orthonormalised, transform
-from vslam.map_view import MapView
-from vslam.states import Standstill
+from vslam.types.context import Context
+from vslam.types.features import PATCH_RADIUS, Features, Pyramid
+from vslam.types.geometry import Matrix, orthonormalised, transform
+from vslam.types.map_view import MapView
+from vslam.types.states import Standstill
 
 _MARGIN = PATCH_RADIUS + 2  # least distance of a patch centre from the border of its level, pixels
 

@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import AlignmentConfig
-from vslam.features import (
+from vslam.frontend.track import Track
+from vslam.support.kernels import kernel
+from vslam.types.features import (
     PATCH_PIXELS,
     PATCH_RADIUS,
     PATCH_SIDE,
@@ -23,10 +25,8 @@ from vslam.features import (
     Pyramid,
     level_pixel,
 )
-from vslam.frontend.track import Track
-from vslam.geometry import Matrix
-from vslam.kernels import kernel
-from vslam.map import Map
+from vslam.types.geometry import Matrix
+from vslam.types.map import Map
 
 
 def patches_around(

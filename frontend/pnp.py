@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from vslam.geometry import symmetric_eigen
-from vslam.kernels import inner_kernel, kernel
-from vslam.ransac import draw_three, draws_needed
-from vslam.reprojection import chi_square_ratio, unpacked
+from vslam.support.kernels import inner_kernel, kernel
+from vslam.support.ransac import draw_three, draws_needed
+from vslam.types.geometry import symmetric_eigen
+from vslam.types.reprojection import chi_square_ratio, unpacked
 
 
 @kernel

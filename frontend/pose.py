@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.geometry import compose, orthonormalised, se3_exp, solve_positive
-from vslam.kernels import inner_kernel, kernel
-from vslam.reprojection import chi_square, chi_square_ratio, residual, unpacked
+from vslam.support.kernels import inner_kernel, kernel
+from vslam.types.geometry import compose, orthonormalised, se3_exp, solve_positive
+from vslam.types.reprojection import chi_square, chi_square_ratio, residual, unpacked
 
 ROUNDS = 4
 ITERATIONS = 10

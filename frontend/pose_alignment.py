@@ -17,8 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import Pyramid
-from vslam.geometry import (
+from vslam.support.kernels import inner_kernel, kernel
+from vslam.types.features import Pyramid
+from vslam.types.geometry import (
     Matrix,
     compose,
     inverse,
@@ -27,7 +28,6 @@ from vslam.geometry import (
     solve_positive,
     transform,
 )
-from vslam.kernels import inner_kernel, kernel
 
 WINDOW = 4  # pixels along each side
 PIXELS = WINDOW * WINDOW

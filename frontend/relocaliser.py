@@ -11,9 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from vslam.camera import Image
-from vslam.context import Context
-from vslam.features import Features, TrackingState
 from vslam.frontend.masks import Mask
 from vslam.frontend.matching import count_elsewhere
 from vslam.frontend.track import By, Images, Track
@@ -24,9 +21,12 @@ from vslam.frontend.tracking import (
     sampled_pose,
     track_local_map,
 )
-from vslam.loops import LastSeen, Localisation, LoopCandidate
-from vslam.map import Map
-from vslam.map_view import LocalMap, local_map
+from vslam.types.camera import Image
+from vslam.types.context import Context
+from vslam.types.features import Features, TrackingState
+from vslam.types.loops import LastSeen, Localisation, LoopCandidate
+from vslam.types.map import Map
+from vslam.types.map_view import LocalMap, local_map
 
 Locate = Callable[[Image | None, Features, Map], list[LoopCandidate]]
 # Finds the pose of a frame near one of the candidates by other means than ORB descriptors.

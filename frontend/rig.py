@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from vslam.camera import Camera
-from vslam.features import Extracted, shifted_columns
 from vslam.frontend.sides import with_pair
 from vslam.frontend.track import Images, Track
-from vslam.geometry import Matrix
-from vslam.image_motion import columns_without_delay
-from vslam.states import ComparedSides
+from vslam.types.camera import Camera
+from vslam.types.features import Extracted, shifted_columns
+from vslam.types.geometry import Matrix
+from vslam.types.image_motion import columns_without_delay
+from vslam.types.states import ComparedSides
 
 
 def corrected(

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import StereoConfig
-from vslam.states import ComparedSides
+from vslam.types.states import ComparedSides
 
 Grey = NDArray[np.uint8]
 

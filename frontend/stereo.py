@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.config import StereoConfig
-from vslam.features import MIN_DISPARITY, level_of, level_pixel
 from vslam.frontend.orb import Extraction
-from vslam.kernels import hamming, inline, inner_kernel, kernel
+from vslam.support.kernels import hamming, inline, inner_kernel, kernel
+from vslam.types.camera import Camera
+from vslam.types.features import MIN_DISPARITY, level_of, level_pixel
 
 LANES = 16  # shifts of the SAD window that are evaluated at once
 # Half width of the patch for sub-pixel refinement, pixels. A larger patch would more often include

@@ -9,15 +9,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Image
-from vslam.features import Extracted, Features, Keypoints, Pyramid, TrackingState
 from vslam.frontend.masks import Mask
 from vslam.frontend.motion_time import motion_seconds
 from vslam.frontend.sides import Sides
-from vslam.geometry import Matrix
-from vslam.loops import LastSeen
-from vslam.map_view import MapView
-from vslam.states import Standstill
+from vslam.types.camera import Image
+from vslam.types.features import Extracted, Features, Keypoints, Pyramid, TrackingState
+from vslam.types.geometry import Matrix
+from vslam.types.loops import LastSeen
+from vslam.types.map_view import MapView
+from vslam.types.states import Standstill
 
 
 class Images(Protocol):

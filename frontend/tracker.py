@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.context import Context
-from vslam.features import Extracted, TrackingState, nearest_features
 from vslam.frontend.patch_tracking import (
     NO_PATCHES_FOUND,
     PatchTrack,
@@ -26,10 +24,12 @@ from vslam.frontend.tracking import (
     track_motion,
     track_sudden_motion,
 )
-from vslam.geometry import Matrix, inverse, transform
-from vslam.machine import StageClock
-from vslam.map_view import MapView
-from vslam.states import Standstill
+from vslam.support.machine import StageClock
+from vslam.types.context import Context
+from vslam.types.features import Extracted, TrackingState, nearest_features
+from vslam.types.geometry import Matrix, inverse, transform
+from vslam.types.map_view import MapView
+from vslam.types.states import Standstill
 
 # The prediction of the motion is wrong by at most this acceleration, m/s^2, in ordinary drives. A
 # pose that implies a larger one needs IMPLAUSIBLE^-1 times as many landmarks that agree with it.

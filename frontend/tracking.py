@@ -11,9 +11,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import DISPARITY_WEIGHT, Camera
-from vslam.context import Context
-from vslam.features import NO_PATCHES, Features, LandmarkPatches, TrackingState
 from vslam.frontend.alignment import align_matches
 from vslam.frontend.masks import Mask
 from vslam.frontend.matching import (
@@ -27,9 +24,12 @@ from vslam.frontend.matching import (
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.pose import MIN_TRUSTED, offset_effect, optimise_pose, pose_covariance
 from vslam.frontend.track import Track
-from vslam.geometry import Matrix, compose, inverse, transform
-from vslam.map_view import LocalMap
-from vslam.reprojection import stack_uvr
+from vslam.types.camera import DISPARITY_WEIGHT, Camera
+from vslam.types.context import Context
+from vslam.types.features import NO_PATCHES, Features, LandmarkPatches, TrackingState
+from vslam.types.geometry import Matrix, compose, inverse, transform
+from vslam.types.map_view import LocalMap
+from vslam.types.reprojection import stack_uvr
 
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:

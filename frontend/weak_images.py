@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import ImageMap
 from vslam.config import Config, WeakImageConfig
-from vslam.features import Pyramid
 from vslam.frontend.orb import Extraction, extract
-from vslam.kernels import kernel
+from vslam.support.kernels import kernel
+from vslam.types.camera import ImageMap
+from vslam.types.features import Pyramid
 
 Grey = NDArray[np.uint8]
 

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import BowConfig
-from vslam.features import Features
-from vslam.kernels import inner_kernel, kernel
 from vslam.loopclosure.bow_index import InvertedIndex, Likeness, grown
 from vslam.loopclosure.detector import require_same
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
-from vslam.loops import DetectorMemory, LoopCandidate, PerKeyframe
-from vslam.map import Map
-from vslam.map_kernels import count_shared
+from vslam.support.kernels import inner_kernel, kernel
+from vslam.types.features import Features
+from vslam.types.loops import DetectorMemory, LoopCandidate, PerKeyframe
+from vslam.types.map import Map
+from vslam.types.map_kernels import count_shared
 
 
 class BowDetector:

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.kernels import kernel
 from vslam.loopclosure.vocabulary import BowVector
+from vslam.support.kernels import kernel
 
 FIRST_BLOCK = 8  # postings in the smallest block: one cache line
 UNIT = 2**31 - 1  # weights are multiples of 1 / UNIT, so that the order of sums does not matter

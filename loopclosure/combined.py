@@ -8,10 +8,10 @@ from itertools import chain, zip_longest
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import Features
 from vslam.loopclosure.detector import LoopDetector, require_same
-from vslam.loops import DetectorMemory, LoopCandidate
-from vslam.map import Map
+from vslam.types.features import Features
+from vslam.types.loops import DetectorMemory, LoopCandidate
+from vslam.types.map import Map
 
 
 class CombinedDetector:

@@ -18,13 +18,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.config import ConsistencyConfig, VerificationConfig
-from vslam.geometry import inverse, se3_log, transform
 from vslam.loopclosure.verification import verify_near
-from vslam.loops import LoopCandidate, LoopEdge, ResembledPlace
-from vslam.map import Map
-from vslam.states import ConsistencyState
+from vslam.types.camera import Camera
+from vslam.types.geometry import inverse, se3_log, transform
+from vslam.types.loops import LoopCandidate, LoopEdge, ResembledPlace
+from vslam.types.map import Map
+from vslam.types.states import ConsistencyState
 
 
 class LoopConsistency:

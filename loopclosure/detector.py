@@ -7,9 +7,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import Features
-from vslam.loops import DetectorMemory, LoopCandidate
-from vslam.map import Map
+from vslam.types.features import Features
+from vslam.types.loops import DetectorMemory, LoopCandidate
+from vslam.types.map import Map
 
 
 class LoopDetector(Protocol):

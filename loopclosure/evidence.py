@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.frontend.matching import count_elsewhere
-from vslam.geometry import Matrix, transform
-from vslam.loops import LoopEdge, LoopEvidence
+from vslam.types.geometry import Matrix, transform
+from vslam.types.loops import LoopEdge, LoopEvidence
 
 
 class Weights(NamedTuple):

@@ -13,11 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.config import LearnedMatchingConfig
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.pose import optimise_pose, pose_covariance
-from vslam.geometry import Matrix, transform
 from vslam.loopclosure.local_matching import (
     DescriptorMaps,
     homography_share,
@@ -26,8 +24,10 @@ from vslam.loopclosure.local_matching import (
     match_coarse,
 )
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.map import Map
-from vslam.reprojection import stack_uvr
+from vslam.types.camera import Camera
+from vslam.types.geometry import Matrix, transform
+from vslam.types.map import Map
+from vslam.types.reprojection import stack_uvr
 
 
 class View(NamedTuple):

@@ -13,10 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, Image
 from vslam.config import Config, LearnedMatchingConfig, VerificationConfig
-from vslam.features import Features, nearest_features
-from vslam.geometry import inverse, orthonormalised, transform
 from vslam.loopclosure.evidence import evidence_of, probability_wrong, weighed
 from vslam.loopclosure.learned_localisation import PoseEstimate, localise, project, view_of
 from vslam.loopclosure.local_matching import DescriptorMaps, likeness, locate_near
@@ -28,9 +25,12 @@ from vslam.loopclosure.verification import (
     place_of,
     relative_scale,
 )
-from vslam.loops import LastSeen, Localisation, LoopCandidate, LoopEdge, LoopEvidence
-from vslam.map import Map
-from vslam.map_kernels import collect_landmarks
+from vslam.types.camera import Camera, Image
+from vslam.types.features import Features, nearest_features
+from vslam.types.geometry import inverse, orthonormalised, transform
+from vslam.types.loops import LastSeen, Localisation, LoopCandidate, LoopEdge, LoopEvidence
+from vslam.types.map import Map
+from vslam.types.map_kernels import collect_landmarks
 
 # A lost frame is not recognised if its pose is wrong with a larger probability. Between different
 # places that look alike, the smallest probability in 15 rendered drives is 0.9.

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.kernels import inner_kernel, kernel
+from vslam.support.kernels import inner_kernel, kernel
 
 COARSE_STRIDE, FINE_STRIDE = 16, 4  # pixels of the network's input per cell
 _HOMOGRAPHY_PIXELS = 12.0  # RANSAC threshold, pixels of the network's input

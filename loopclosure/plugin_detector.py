@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import Config
-from vslam.errors import InputError
-from vslam.features import Features
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loops import DetectorMemory, LoopCandidate
-from vslam.map import Map
-from vslam.plugins import PlugIn
+from vslam.support.errors import InputError
+from vslam.support.plugins import PlugIn
+from vslam.types.features import Features
+from vslam.types.loops import DetectorMemory, LoopCandidate
+from vslam.types.map import Map
 
 _METHODS = ("add", "query", "locate")
 

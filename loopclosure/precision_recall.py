@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import SiameseConfig
-from vslam.geometry import inverses
-from vslam.loops import LastSeen
-from vslam.map import Map
+from vslam.types.geometry import inverses
+from vslam.types.loops import LastSeen
+from vslam.types.map import Map
 
 
 def beyond_reach(map_: Map, keyframe: int, config: SiameseConfig) -> NDArray[np.float64]:

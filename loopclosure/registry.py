@@ -7,12 +7,12 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vslam import plugins
 from vslam.config import Config
-from vslam.errors import InputError, did_you_mean
 from vslam.loopclosure.detector import LoopDetector, NoDetector
 from vslam.loopclosure.plugin_detector import PlugInDetector, open_plugin
 from vslam.loopclosure.siamese.weights import NETWORKS, TO_THE_LETTER, find_weights
+from vslam.support import plugins
+from vslam.support.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from vslam.loopclosure.siamese.local_descriptors import KeyframeImages

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.geometry import compose, orthonormalised, se3_exp, solve_positive, symmetric_eigen
-from vslam.kernels import inner_kernel, kernel
-from vslam.ransac import draw_three, draws_needed
-from vslam.reprojection import chi_square, chi_square_ratio, residual, unpacked
+from vslam.support.kernels import inner_kernel, kernel
+from vslam.support.ransac import draw_three, draws_needed
+from vslam.types.geometry import compose, orthonormalised, se3_exp, solve_positive, symmetric_eigen
+from vslam.types.reprojection import chi_square, chi_square_ratio, residual, unpacked
 
 REFITS = 4
 SAMPLE_ITERATIONS, REFIT_ITERATIONS = 3, 5

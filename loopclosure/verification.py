@@ -18,9 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.config import VerificationConfig
-from vslam.features import FeatureGrid
 from vslam.frontend.matching import (
     Projections,
     Searchable,
@@ -30,13 +28,15 @@ from vslam.frontend.matching import (
     search_windows,
 )
 from vslam.frontend.pose import optimise_pose, pose_covariance
-from vslam.geometry import Matrix, inverse, orthonormalised, transform
 from vslam.loopclosure.evidence import evidence_of, weighed
 from vslam.loopclosure.sim3_ransac import ObservedPoints, align
-from vslam.loops import LoopCandidate, LoopEdge
-from vslam.map import Map
-from vslam.map_kernels import collect_landmarks
-from vslam.reprojection import stack_uvr
+from vslam.types.camera import Camera
+from vslam.types.features import FeatureGrid
+from vslam.types.geometry import Matrix, inverse, orthonormalised, transform
+from vslam.types.loops import LoopCandidate, LoopEdge
+from vslam.types.map import Map
+from vslam.types.map_kernels import collect_landmarks
+from vslam.types.reprojection import stack_uvr
 
 MIN_DEPTHS = 10  # least number of features with landmarks on both sides to estimate the scale
 

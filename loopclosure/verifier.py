@@ -10,7 +10,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.config import Config
 from vslam.loopclosure import verification
 from vslam.loopclosure.learned_verification import (
@@ -20,9 +19,10 @@ from vslam.loopclosure.learned_verification import (
 )
 from vslam.loopclosure.reach import beyond_reach
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.loops import LoopCandidate, LoopEdge
-from vslam.map import Map
-from vslam.states import VerifierState
+from vslam.types.camera import Camera
+from vslam.types.loops import LoopCandidate, LoopEdge
+from vslam.types.map import Map
+from vslam.types.states import VerifierState
 
 Descriptors = Literal["orb", "learned"]
 

@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, write_file
-from vslam.kernels import hamming, kernel
-from vslam.untrusted import read_npz
+from vslam.support.errors import InputError, write_file
+from vslam.support.kernels import hamming, kernel
+from vslam.support.untrusted import read_npz
 
 SCHEMA = 1
 SHIPPED = Path(__file__).with_name("vocabulary.npz")

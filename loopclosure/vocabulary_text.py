@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, write_file
 from vslam.loopclosure.vocabulary import (
     MAX_BRANCHING,
     MAX_LEVELS,
@@ -25,6 +24,7 @@ from vslam.loopclosure.vocabulary import (
     load,
     save,
 )
+from vslam.support.errors import InputError, write_file
 
 NUMBERS = 35  # numbers per line of a node: parent, leaf, 32 bytes, weight
 L1_NORM, TF_IDF = 0, 0  # DBoW2's codes for the scoring and the weighting of vslam

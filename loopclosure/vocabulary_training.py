@@ -16,8 +16,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.kernels import hamming, inner_kernel, kernel
 from vslam.loopclosure.vocabulary import MAX_BRANCHING, MAX_LEVELS, Vocabulary, from_children
+from vslam.support.kernels import hamming, inner_kernel, kernel
 
 TRIALS = 4  # candidates per centre in greedy k-means++: about 2 + ln k
 ITERATIONS = 12  # maximum number of majority votes in a node; most nodes converge earlier

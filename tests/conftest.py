@@ -11,16 +11,16 @@ import cv2
 import numpy as np
 import pytest
 
-from vslam.camera import Camera
 from vslam.cli import main as cli
 from vslam.datasets.kitti import open_kitti
 from vslam.datasets.synthetic.routes import built_in_route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import render_sequence
-from vslam.geometry import se3_exp
-from vslam.map import Map
 from vslam.run.warmup import compile_kernels
-from vslam.trajectory import write_kitti
+from vslam.types.camera import Camera
+from vslam.types.geometry import se3_exp
+from vslam.types.map import Map
+from vslam.types.trajectory import write_kitti
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -32,16 +32,16 @@ import cv2
 import numpy as np
 from ring import CAMERA, LAP, Oracle, Ring
 
-from vslam.camera import ImageMap
 from vslam.config import Config
 from vslam.datasets.frames import Images, Source, TimedFrame
-from vslam.features import Extracted, Features
-from vslam.geometry import inverse
 from vslam.maps.storage import load_map
 from vslam.run.autosave import MAP, PROGRESS
 from vslam.run.progress import read_progress
 from vslam.slam import Slam
-from vslam.trajectory import read_trajectory, write_kitti
+from vslam.types.camera import ImageMap
+from vslam.types.features import Extracted, Features
+from vslam.types.geometry import inverse
+from vslam.types.trajectory import read_trajectory, write_kitti
 
 RING = Ring.create(focal_error=0.015)  # odometry drifts, so that the loop has an error to correct
 FRAMES = LAP + 31
@@ -84,22 +84,22 @@ REALTIME = ("--realtime", "--max-frames", "12")
 LATER = ("report.json", "report.md", "report.html", "figures")  # written after all other results
 POINTS = (
     Point("a frame's track", "vslam.frontend.tracker.Tracker.track", 200, EARLY),
-    Point("keyframe policy", "vslam.modes.Building.update_map", 200, EARLY),
-    Point("publishing a keyframe", "vslam.published_map.PublishedMap._renew_view", 8, EARLY),
+    Point("keyframe policy", "vslam.method.modes.Building.update_map", 200, EARLY),
+    Point("publishing a keyframe", "vslam.method.published_map.PublishedMap._renew_view", 8, EARLY),
     Point("place detector, locate", "ring.Oracle.locate", 2, EARLY),
     Point("place detector, add", "ring.Oracle.add", 12, ON),
     Point("place detector, query", "ring.Oracle.query", 12, ON),
     Point("verification", "vslam.loopclosure.verification.verify", 1, ON),
     Point("learned verification", "vslam.loopclosure.verifier.with_similarities", 1, ON),
-    Point("pose graph", "vslam.closing.solve", 1, ON),
-    Point("inserting a keyframe", "vslam.mapping.map_stereo_points", 12, MAPLESS),
-    Point("mapping job", "vslam.mapping.map_and_calibrate", 12, MAPLESS),
-    Point("start of a job", "vslam.shared_map.SharedMap.start", 12, MAPLESS),
-    Point("closing job, correction", "vslam.closing.move_keyframes", 1, MAPLESS),
-    Point("closing job, fusion", "vslam.closing.fuse_loop", 1, MAPLESS),
-    Point("global adjustment, snapshot", "vslam.closing.take_snapshot", 1, ON),
-    Point("global adjustment", "vslam.closing.adjust_globally", 1, ON),
-    Point("global adjustment, merge", "vslam.closing.merge_solution", 1, MAPLESS),
+    Point("pose graph", "vslam.method.closing.solve", 1, ON),
+    Point("inserting a keyframe", "vslam.method.mapping.map_stereo_points", 12, MAPLESS),
+    Point("mapping job", "vslam.method.mapping.map_and_calibrate", 12, MAPLESS),
+    Point("start of a job", "vslam.method.shared_map.SharedMap.start", 12, MAPLESS),
+    Point("closing job, correction", "vslam.method.closing.move_keyframes", 1, MAPLESS),
+    Point("closing job, fusion", "vslam.method.closing.fuse_loop", 1, MAPLESS),
+    Point("global adjustment, snapshot", "vslam.method.closing.take_snapshot", 1, ON),
+    Point("global adjustment", "vslam.method.closing.adjust_globally", 1, ON),
+    Point("global adjustment, merge", "vslam.method.closing.merge_solution", 1, MAPLESS),
     Point("image source", "faults.next_image", 200, EARLY),
     Point("image reader", "faults.read_image", 200, EARLY),
     Point("features thread", "vslam.frontend.extraction.find_corners", 200, EARLY),
@@ -115,8 +115,8 @@ POINTS = (
     Point("recorder, loop picture", "vslam.run.recorder.draw_picture", 1, ON),
     Point("moments", "vslam.run.moments._moment", 12, ON),
     Point("loop pictures", "vslam.run.moments.loop_matches", 1, ON),
-    Point("closing the map", "vslam.closing.LoopClosing.conclude", 1, MAPLESS),
-    Point("final trajectory", "vslam.published_map.PublishedMap.trajectory", 1, EARLY),
+    Point("closing the map", "vslam.method.closing.LoopClosing.conclude", 1, MAPLESS),
+    Point("final trajectory", "vslam.method.published_map.PublishedMap.trajectory", 1, EARLY),
     Point("check of the rig", "vslam.run.pipeline.measure_offset", 1, ON),
     Point("result: KITTI poses", "vslam.report.folder.write_kitti", 1, MISSING,
           ("trajectory_kitti.txt",)),

@@ -11,7 +11,7 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from mcap.writer import Writer as McapWriter
 
-from vslam.camera import Camera
+from vslam.types.camera import Camera
 
 TYPES = {"string": 9, "fixed32": 7, "bytes": 12, "double": 1}
 FIELDS = {

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vslam.camera import Camera
-from vslam.features import Features
-from vslam.geometry import inverse
-from vslam.loops import DetectorMemory, LoopCandidate
-from vslam.map import Map
+from vslam.types.camera import Camera
+from vslam.types.features import Features
+from vslam.types.geometry import inverse
+from vslam.types.loops import DetectorMemory, LoopCandidate
+from vslam.types.map import Map
 
 CAMERA = Camera(500.0, 500.0, 400.0, 150.0, 0.5, 800, 300)
 RADIUS, STEP = 50.0, 1.5  # radius of the road, and distance between frames, in metres

@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vslam.camera import Camera
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions, open_source
@@ -16,6 +15,7 @@ from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.types.camera import Camera
 
 NO_OPTIONS = SourceOptions()
 LEFT, RIGHT = "/cam0/image_raw", "/cam1/image_raw"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vslam.camera import DISPARITY_WEIGHT
+from vslam.types.camera import DISPARITY_WEIGHT
 
 # Converts errors of u, v and u_right to errors of u, v and the disparity, in standard deviations.
 WHITENING = np.diag([1.0, 1.0, DISPARITY_WEIGHT]) @ np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 1]])

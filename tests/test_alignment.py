@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 from parts import frame_of
 
-from vslam.camera import Camera
 from vslam.config import Config
-from vslam.context import Context
-from vslam.features import (
+from vslam.frontend.alignment import align, align_matches, warps
+from vslam.frontend.orb import build_pyramid, extract
+from vslam.frontend.patches import RecentPatches, patches_around
+from vslam.frontend.tracking import refine
+from vslam.method.mapping import Mapper
+from vslam.support.workers import Workers
+from vslam.types.camera import Camera
+from vslam.types.context import Context
+from vslam.types.features import (
     NO_PATCHES,
     PATCH_PIXELS,
     PATCH_RADIUS,
@@ -17,16 +23,10 @@ from vslam.features import (
     Features,
     KeyframePatches,
 )
-from vslam.frontend.alignment import align, align_matches, warps
-from vslam.frontend.orb import build_pyramid, extract
-from vslam.frontend.patches import RecentPatches, patches_around
-from vslam.frontend.tracking import refine
-from vslam.geometry import inverse, se3_exp, transform
-from vslam.map import Map
-from vslam.map_kernels import link_many, unlink
-from vslam.map_view import NO_LANDMARKS
-from vslam.mapping import Mapper
-from vslam.workers import Workers
+from vslam.types.geometry import inverse, se3_exp, transform
+from vslam.types.map import Map
+from vslam.types.map_kernels import link_many, unlink
+from vslam.types.map_view import NO_LANDMARKS
 
 CONFIG = Config().alignment
 NO_SHIFT = np.zeros((1, 2), np.float32)
@@ -366,9 +366,9 @@ def test_the_map_knows_how_sure_each_observation_is(two_keyframes):
 @pytest.fixture
 def two_keyframes():
     """Add a second keyframe, which tracks two landmarks of the first keyframe."""
-    from vslam.closing import LoopClosing
     from vslam.loopclosure.detector import NoDetector
     from vslam.loopclosure.verifier import Verifier
+    from vslam.method.closing import LoopClosing
 
     config = Config()
     closing = LoopClosing(NoDetector(), Verifier(config, CAMERA), CAMERA, config, threads=1)

@@ -20,10 +20,7 @@ from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.frames import Source, stored_frames
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.features import TrackingState, TrackResult
-from vslam.loops import LoopCorrection, LoopEdge
 from vslam.maps.storage import load_checkpoint, load_map
 from vslam.report.folder import write_results
 from vslam.run import autosave as saving
@@ -44,7 +41,10 @@ from vslam.run.pipeline import _with_earlier, run_sequence
 from vslam.run.progress import Progress, TrackLog, TrackTable, read_progress, write_progress
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
-from vslam.trajectory import read_trajectory
+from vslam.support.errors import InputError
+from vslam.types.features import TrackingState, TrackResult
+from vslam.types.loops import LoopCorrection, LoopEdge
+from vslam.types.trajectory import read_trajectory
 
 FRAMES = 28
 

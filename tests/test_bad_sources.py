@@ -27,7 +27,7 @@ from source_files import (
 from vslam.datasets import video
 from vslam.datasets.frames import selected
 from vslam.datasets.sources import SourceOptions
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 FRAMES = 12
 

@@ -17,7 +17,7 @@ from rosbags.rosbag2 import reader as ros2
 
 from vslam.datasets import bag_limits
 from vslam.datasets.bag import open_bag
-from vslam.errors import BrokenSourceError, InputError
+from vslam.support.errors import BrokenSourceError, InputError
 
 KINDS = [("ros1", "bz2"), ("ros1", "lz4"), ("ros2", "file"), ("ros2", "message"),
          ("mcap", "storage"), ("folder", "storage")]  # fmt: skip

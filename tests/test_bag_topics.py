@@ -18,7 +18,7 @@ from vslam.datasets.bag import open_bag
 from vslam.datasets.bag_messages import camera_info, depth_in
 from vslam.datasets.bag_topics import camera_info_of
 from vslam.datasets.sources import SourceOptions, open_raw
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 WIDTH, HEIGHT = 64, 48
 FOCAL, CENTRE = 50.0, (31.0, 24.0)

@@ -21,9 +21,9 @@ from typer.testing import CliRunner
 from vslam.cli import main as cli
 from vslam.cli.main import app
 from vslam.config import Config
-from vslam.errors import InputError, ResultsError
 from vslam.lab.bench import estimate, execute, grid, table
 from vslam.lab.bench.grid import Cell
+from vslam.support.errors import InputError, ResultsError
 
 CONFIG = Config().model_dump_json(indent=2) + "\n"
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from vslam.config import BowConfig
-from vslam.features import Features
 from vslam.lab.loopbench.node_matching import index_nodes, match_by_node
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.bow_index import InvertedIndex
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector, from_children, score
 from vslam.loopclosure.vocabulary_training import train
-from vslam.map import Map
-from vslam.map_kernels import link_many
+from vslam.types.features import Features
+from vslam.types.map import Map
+from vslam.types.map_kernels import link_many
 
 WORDS = 400
 

@@ -10,9 +10,9 @@ import pytest
 from stereo_noise import WHITENING, white_noise
 
 from vslam.backend.bundle_adjustment import BundleProblem, adjust, cholesky_solve
-from vslam.camera import Camera
-from vslam.geometry import se3_exp, se3_log, transform
-from vslam.reprojection import CHI2_MONO, CHI2_STEREO
+from vslam.types.camera import Camera
+from vslam.types.geometry import se3_exp, se3_log, transform
+from vslam.types.reprojection import CHI2_MONO, CHI2_STEREO
 
 CAMERA = Camera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)
 N_FREE, N_FIXED = 4, 2

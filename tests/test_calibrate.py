@@ -27,8 +27,8 @@ from vslam.calibration.solve import Estimate, diverse, fit_camera, fit_pair
 from vslam.cli.calibrate import _frames
 from vslam.datasets.frames import RawSource, TimedFrame
 from vslam.doctor.calibration_page import findings_of
-from vslam.errors import BrokenSourceError, InputError
-from vslam.geometry import transform
+from vslam.support.errors import BrokenSourceError, InputError
+from vslam.types.geometry import transform
 
 PINHOLE = CameraModel(
     300.0, 300.6, 193.2, 142.8, 384, 288, "pinhole", (-0.25, 0.07, 0.0005, -0.0004)

@@ -13,12 +13,12 @@ from conftest import StereoSequence
 
 from vslam.calibration.models import Calibration, CameraModel, project, unproject, without_zeros
 from vslam.calibration.rectification import rectify
-from vslam.camera import Camera, calibration_doubts
 from vslam.datasets.frames import RawSource, stored_frames
 from vslam.datasets.rectified import rectified
-from vslam.errors import InputError
-from vslam.geometry import se3_exp
 from vslam.run.rig import calibration_warnings
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera, calibration_doubts
+from vslam.types.geometry import se3_exp
 
 RADTAN = (-0.283, 0.074, 0.00019, -0.0017, 0.002, 0.01, -0.02, 0.003)
 PINHOLE = CameraModel(458.654, 457.296, 367.215, 248.375, 752, 480)

@@ -14,8 +14,8 @@ import pytest
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
 from vslam.calibration.rectification import rectify
-from vslam.errors import InputError
-from vslam.geometry import inverse, se3_exp
+from vslam.support.errors import InputError
+from vslam.types.geometry import inverse, se3_exp
 
 SIZE = (752, 480)
 LEFT = CameraModel(

@@ -8,7 +8,6 @@ import reference_routing
 import torch
 from siamese_worlds import SMALL, masked, small_network
 
-from vslam.errors import InputError
 from vslam.loopclosure.siamese.images import to_size
 from vslam.loopclosure.training import capsules
 from vslam.loopclosure.training.branches import (
@@ -25,6 +24,7 @@ from vslam.loopclosure.training.siamese import (
     load_network,
     save_network,
 )
+from vslam.support.errors import InputError
 
 
 def images(n: int = 3, pixels: int = 64, seed: int = 0) -> torch.Tensor:

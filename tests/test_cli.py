@@ -19,17 +19,13 @@ import numpy as np
 import pytest
 from test_report import make_outcome
 
-from vslam import machine
 from vslam.cli import main as cli
 from vslam.cli import options, train
 from vslam.cli import run as run_command
 from vslam.config import PRESETS, as_config, changed_thresholds, thresholds_in_words
 from vslam.datasets import open_sequence, png
-from vslam.errors import InputError
-from vslam.features import TrackingState, TrackResult
 from vslam.loopclosure.registry import DETECTORS
 from vslam.loopclosure.siamese.weights import NETWORKS
-from vslam.loops import LoopEdge
 from vslam.report import figures
 from vslam.report.folder import write_results
 from vslam.report.run_page import option_rows
@@ -40,7 +36,11 @@ from vslam.run.autosave import MAP
 from vslam.run.moments import MomentRecorder
 from vslam.run.outcome import RunOutcome
 from vslam.slam import Slam
-from vslam.trajectory import (
+from vslam.support import machine
+from vslam.support.errors import InputError
+from vslam.types.features import TrackingState, TrackResult
+from vslam.types.loops import LoopEdge
+from vslam.types.trajectory import (
     Trajectory,
     read_kitti_poses,
     read_trajectory,

@@ -11,17 +11,17 @@ import pytest
 from ring import CAMERA, LAP, Oracle, Ring
 
 from vslam.backend.pose_graph import GAP, WEAK, connectivity
-from vslam.closing import LoopClosing
 from vslam.config import Config, ConsistencyConfig, KeyframeConfig, LoopConfig, PoseGraphConfig
-from vslam.features import Extracted, Features, TrackingState
-from vslam.geometry import inverse
-from vslam.hypotheses import Hypothesis, joined_submaps, solve
 from vslam.loopclosure.detector import NoDetector
 from vslam.loopclosure.verification import verify
 from vslam.loopclosure.verifier import Verifier
-from vslam.loops import LoopCandidate
-from vslam.map import UNPREDICTED
+from vslam.method.closing import LoopClosing
+from vslam.method.hypotheses import Hypothesis, joined_submaps, solve
 from vslam.slam import Slam
+from vslam.types.features import Extracted, Features, TrackingState
+from vslam.types.geometry import inverse
+from vslam.types.loops import LoopCandidate
+from vslam.types.map import UNPREDICTED
 
 ROUND = [float(k) for k in range(LAP + 40)]
 DRIFTING = Ring.create(focal_error=0.015)
@@ -377,7 +377,7 @@ def test_a_global_adjustment_that_fails_leaves_the_map_as_it_was(monkeypatch, ca
     candidates = [LoopCandidate(edge.query, edge.match, 1.0)]
     closing = closing_of(edge, Config(), threads)
     with monkeypatch.context() as patched:
-        patched.setattr("vslam.closing.adjust_globally", fail)
+        patched.setattr("vslam.method.closing.adjust_globally", fail)
         closing.consider(map_, edge.query, candidates)
         assert closing.is_adjusting
         before = map_.copy().arrays

@@ -16,10 +16,10 @@ import pytest
 from stub_runner import COMMAND, started, wait_for
 
 from vslam.config import Config
-from vslam.errors import InputError
 from vslam.lab.bench import execute
 from vslam.lab.bench.cluster import run_on_cluster
 from vslam.lab.bench.grid import make_grid
+from vslam.support.errors import InputError
 
 CONFIG = Config().model_dump_json(indent=2) + "\n"
 CELLS = make_grid("kitti", ["00", "05"], ["none", "brightness:1"], ["none", "bow"], 1)
@@ -115,7 +115,7 @@ def test_an_address_that_cannot_be_used_leaves_no_client_behind(address: str, sa
     code = (
         "from vslam.lab.bench.cluster import run_on_cluster\n"
         "from vslam.lab.bench.execute import RunOptions\n"
-        "from vslam.errors import InputError\n"
+        "from vslam.support.errors import InputError\n"
         "try:\n"
         f"    next(run_on_cluster([], RunOptions(None, '', 1), {address!r}, None))\n"
         "except InputError as error:\n"

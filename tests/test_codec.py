@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vslam.maps.checkpoint import CHECKPOINTS
 from vslam.maps.codec import Codec
 from vslam.run.progress import PROGRESS, Progress
-from vslam.states import Checkpoint
+from vslam.types.states import Checkpoint
 
 
 class Colour(StrEnum):

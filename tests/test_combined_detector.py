@@ -9,11 +9,11 @@ import pytest
 from test_siamese_detector import a_map
 
 from vslam.config import Config, VerificationConfig
-from vslam.errors import InputError
-from vslam.features import Features
 from vslam.loopclosure.combined import CombinedDetector
 from vslam.loopclosure.registry import create_detector, create_images, require_detector
-from vslam.loops import LoopCandidate
+from vslam.support.errors import InputError
+from vslam.types.features import Features
+from vslam.types.loops import LoopCandidate
 
 
 class Told:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from vslam.config import ConsistencyConfig
-from vslam.geometry import compose, inverse, se3_exp, se3_log
 from vslam.loopclosure.consistency import LoopConsistency, implied_drift
-from vslam.loops import LoopCandidate, LoopEdge
+from vslam.types.geometry import compose, inverse, se3_exp, se3_log
+from vslam.types.loops import LoopCandidate, LoopEdge
 
 STRICT = ConsistencyConfig(min_keyframes=3, max_gap=0)  # the rule of ORB-SLAM
 DRIFT = se3_exp(np.array([2.0, 0.3, -4.0, 0.01, 0.12, 0.0]))

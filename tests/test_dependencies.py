@@ -26,30 +26,44 @@ FOLDERS = {
 # The lowest level comes first. A module belongs to the longest of these names that is a prefix of
 # its name. Names on one level may not import each other, except as listed in SIBLINGS.
 LEVELS: tuple[tuple[str, ...], ...] = (
-    ("vslam.errors", "vslam.machine", "vslam.method", "vslam.workers"),
-    ("vslam.kernels", "vslam.plugins", "vslam.untrusted", "vslam.lock_file", "vslam.file_kinds"),
-    ("vslam.config", "vslam.geometry", "vslam.ransac", "vslam.camera"),
-    ("vslam.odometry", "vslam.context"),
-    ("vslam.features",),
     (
-        "vslam.loops",
-        "vslam.reprojection",
-        "vslam.image_motion",
-        "vslam.trajectory",
-        "vslam.map_kernels",
+        "vslam.support",
+        "vslam.types",
+        "vslam.method",
+        "vslam.support.errors",
+        "vslam.support.machine",
+        "vslam.method.version",
+        "vslam.support.workers",
+    ),
+    (
+        "vslam.support.kernels",
+        "vslam.support.plugins",
+        "vslam.support.untrusted",
+        "vslam.support.lock_file",
+        "vslam.support.file_kinds",
+    ),
+    ("vslam.config", "vslam.types.geometry", "vslam.support.ransac", "vslam.types.camera"),
+    ("vslam.types.odometry", "vslam.types.context"),
+    ("vslam.types.features",),
+    (
+        "vslam.types.loops",
+        "vslam.types.reprojection",
+        "vslam.types.image_motion",
+        "vslam.types.trajectory",
+        "vslam.types.map_kernels",
         "vslam.calibration",
     ),
-    ("vslam.revisits",),
-    ("vslam.map", "vslam.frame_poses", "vslam.states"),
-    ("vslam.map_view", "vslam.shared_map"),
+    ("vslam.types.revisits",),
+    ("vslam.types.map", "vslam.types.frame_poses", "vslam.types.states"),
+    ("vslam.types.map_view", "vslam.method.shared_map"),
     ("vslam.frontend", "vslam.backend", "vslam.loopclosure", "vslam.datasets", "vslam.maps"),
-    ("vslam.hypotheses",),
-    ("vslam.starter", "vslam.closing", "vslam.motion"),
-    ("vslam.map_frames", "vslam.gaps"),
-    ("vslam.published_map", "vslam.merging"),
-    ("vslam.mapping",),
-    ("vslam.modes",),
-    ("vslam.session",),
+    ("vslam.method.hypotheses",),
+    ("vslam.method.starter", "vslam.method.closing", "vslam.method.motion"),
+    ("vslam.method.map_frames", "vslam.method.gaps"),
+    ("vslam.method.published_map", "vslam.method.merging"),
+    ("vslam.method.mapping",),
+    ("vslam.method.modes",),
+    ("vslam.method.session",),
     ("vslam.slam",),
     ("vslam.run",),
     ("vslam.evaluation",),
@@ -197,8 +211,8 @@ def test_the_reader_of_imports_sees_every_form():
 
 def test_the_modules_and_their_imports_are_found():
     assert {"vslam.frontend", "vslam.loopclosure", "vslam.backend", "vslam.cli"} <= set(SOURCES)
-    assert "vslam.map_view" in ARROWS["vslam.frontend.tracking"]
-    assert "vslam.frontend.tracker" in ARROWS["vslam.session"]
+    assert "vslam.types.map_view" in ARROWS["vslam.frontend.tracking"]
+    assert "vslam.frontend.tracker" in ARROWS["vslam.method.session"]
     assert "vslam.lab.bench.execute" in ARROWS["vslam.cli.bench"]
 
 
@@ -225,7 +239,7 @@ def test_no_circle_of_imports():
 
 
 def test_an_upward_import_and_a_circle_would_be_seen():
-    assert upward({"vslam.map": {"vslam.slam"}}) == ["vslam.map -> vslam.slam"]
+    assert upward({"vslam.types.map": {"vslam.slam"}}) == ["vslam.types.map -> vslam.slam"]
     assert upward({"vslam.backend.fusion": {"vslam.frontend.orb"}})
     assert upward({"vslam.lab.bench.table": {"vslam.cli.progress"}})
     assert set(circle({"a": {"b"}, "b": {"c"}, "c": {"a"}})) == {"a", "b", "c"}

@@ -16,7 +16,7 @@ from source_files import open_from, run_source, write_calibration
 
 from vslam.datasets import depth_cameras
 from vslam.datasets.sources import SourceOptions
-from vslam.errors import BrokenSourceError, InputError
+from vslam.support.errors import BrokenSourceError, InputError
 
 FRAMES = 8
 PACKAGES = {"realsense": "pyrealsense2", "oakd": "depthai"}

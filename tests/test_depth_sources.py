@@ -14,12 +14,12 @@ import pytest
 from conftest import StereoSequence, corridor_depth
 from source_files import open_from, run_source, write_bag, write_calibration, write_images
 
-from vslam.camera import Camera
 from vslam.datasets.association import Pairing
 from vslam.datasets.bag import _synchronised
 from vslam.datasets.detection import detect_dataset
 from vslam.datasets.sources import SourceOptions
-from vslam.errors import InputError
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera
 
 FRAMES = 8
 COLOUR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"

@@ -8,9 +8,9 @@ from stereo_noise import white_noise
 
 from vslam.backend.bundle_adjustment import BundleProblem
 from vslam.backend.disparity_offset import VARIANCE, offset_sigma, remaining_offset
-from vslam.camera import Camera
 from vslam.config import StereoConfig
-from vslam.features import MIN_DISPARITY, shifted_columns
+from vslam.types.camera import Camera
+from vslam.types.features import MIN_DISPARITY, shifted_columns
 
 CAMERA = Camera(700.0, 700.0, 600.0, 180.0, 0.54, 1200, 370)
 N_CAMERAS = 8

@@ -13,7 +13,6 @@ from conftest import StereoSequence
 from source_files import write_calibration, write_video
 from typer.testing import CliRunner
 
-from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import Config, as_config
 from vslam.datasets.association import Pairing
@@ -24,7 +23,8 @@ from vslam.datasets.times import Timing, in_order
 from vslam.datasets.tum import open_tum
 from vslam.doctor.checks import check_depth, check_times
 from vslam.doctor.examine import examine
-from vslam.errors import ResultsError, UnreadableImageError
+from vslam.support.errors import ResultsError, UnreadableImageError
+from vslam.types.camera import Camera
 
 REAL = Path(__file__).parents[2] / "shared/data"
 FEW = as_config({"orb": {"n_features": 500}})  # for images of 480x160

@@ -15,12 +15,12 @@ from vslam.datasets import open_sequence
 from vslam.datasets.association import poses_at
 from vslam.datasets.euroc import _pair, open_euroc, open_raw_euroc
 from vslam.datasets.perturbation import Perturbation
-from vslam.errors import InputError, UnreadableImageError
-from vslam.geometry import se3_exp
 from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
-from vslam.trajectory import Trajectory
+from vslam.support.errors import InputError, UnreadableImageError
+from vslam.types.geometry import se3_exp
+from vslam.types.trajectory import Trajectory
 
 REAL = Path(__file__).parents[2] / "shared/data/euroc/V1_01_start"
 FRAMES = 6

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vslam.evaluation.loops import judge_loops, metres_per_unit, revisits
-from vslam.loops import LoopEdge
+from vslam.types.loops import LoopEdge
 
 Poses = NDArray[np.float64]
 STEP_M, FRAME_S = 1.0, 0.1

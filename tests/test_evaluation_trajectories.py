@@ -14,7 +14,6 @@ from evo.core.metrics import APE, RPE, PoseRelation
 from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
-from vslam.errors import InputError
 from vslam.evaluation.trajectories import (
     command_of_evo,
     evaluate_trajectory,
@@ -23,7 +22,14 @@ from vslam.evaluation.trajectories import (
     path_length,
     read_pair,
 )
-from vslam.trajectory import Trajectory, trajectory_format, write_euroc, write_kitti, write_tum
+from vslam.support.errors import InputError
+from vslam.types.trajectory import (
+    Trajectory,
+    trajectory_format,
+    write_euroc,
+    write_kitti,
+    write_tum,
+)
 
 
 def drive(n: int = 2001, step: float = 0.5, turn: float = 0.004) -> Trajectory:

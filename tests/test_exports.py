@@ -21,16 +21,9 @@ from test_pipeline import run as run_pipeline
 from typer.testing import CliRunner
 
 from vslam.backend.pose_graph import GAP, LOOP, TREE, edge_errors, essential_graph
-from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import PoseGraphConfig, load_config
 from vslam.datasets import open_sequence
-from vslam.errors import InputError, ResultsError
-from vslam.features import Features
-from vslam.geometry import inverses, se3_exp
-from vslam.loops import LoopEdge
-from vslam.map import Map
-from vslam.map_kernels import erase_landmark, link_many, unlink
 from vslam.maps.colmap import save_colmap
 from vslam.maps.formats import landmark_colours, save_g2o, save_nerfstudio, save_ply
 from vslam.maps.new_output import new_output
@@ -40,7 +33,14 @@ from vslam.maps.stored_map import StoredMap
 from vslam.report.finished_run import read_run
 from vslam.report.folder import write_results
 from vslam.run.options import RunOptions, write_options
-from vslam.trajectory import Trajectory, write_euroc
+from vslam.support.errors import InputError, ResultsError
+from vslam.types.camera import Camera
+from vslam.types.features import Features
+from vslam.types.geometry import inverses, se3_exp
+from vslam.types.loops import LoopEdge
+from vslam.types.map import Map
+from vslam.types.map_kernels import erase_landmark, link_many, unlink
+from vslam.types.trajectory import Trajectory, write_euroc
 
 CAMERA = Camera(300.0, 310.0, 159.5, 119.5, 0.4, 320, 240)
 NOISE = 0.2  # pixels

@@ -15,8 +15,8 @@ import pytest
 from faults import FAULTS, FRAMES, MAPLESS, POINTS, RING, failing, view
 from ring import CAMERA, Oracle
 
-from vslam.features import Extracted
 from vslam.slam import Slam
+from vslam.types.features import Extracted
 
 TOOL = Path(__file__).parents[1] / "tools" / "experiments" / "lifelong" / "inject_faults.py"
 INCOMPLETE = r"^mapping a keyframe failed .* incomplete; continue from a map that was saved before$"
@@ -30,9 +30,9 @@ SOME = [  # one of each kind; tools/experiments/lifelong tests all of them
     "result: figures",
     "warm-up of the kernels",
 ]
-CORE = ("vslam.frontend.tracker.", "vslam.modes.", "vslam.mapping.", "vslam.published_map.",
-        "vslam.shared_map.", "vslam.closing.", "vslam.loopclosure.verification.",
-        "ring.")  # fmt: skip
+CORE = ("vslam.frontend.tracker.", "vslam.method.modes.", "vslam.method.mapping.",
+        "vslam.method.published_map.", "vslam.method.shared_map.", "vslam.method.closing.",
+        "vslam.loopclosure.verification.", "ring.")  # fmt: skip
 
 
 def test_every_point_names_a_function_that_exists():

@@ -15,8 +15,8 @@ from vslam.datasets.detection import detect_dataset
 from vslam.datasets.image_files import read_grey
 from vslam.datasets.image_folders import open_images
 from vslam.datasets.video import open_video
-from vslam.errors import InputError
-from vslam.file_kinds import identify, read_text, what_is_in
+from vslam.support.errors import InputError
+from vslam.support.file_kinds import identify, read_text, what_is_in
 
 HEIC = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic"
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vslam.frame_poses import FramePoses
-from vslam.geometry import inverse, se3_exp
+from vslam.types.frame_poses import FramePoses
+from vslam.types.geometry import inverse, se3_exp
 
 
 class Keyframes:

@@ -15,13 +15,13 @@ from test_report import make_outcome
 from typer.testing import CliRunner
 
 from vslam.cli.main import app
-from vslam.features import Extracted, Features, TrackingState
-from vslam.gaps import Gap, GapKind, sentences
-from vslam.geometry import inverse, orthonormalised, se3_log
-from vslam.odometry import relative_covariance
+from vslam.method.gaps import Gap, GapKind, sentences
 from vslam.report.folder import write_results
 from vslam.slam import Slam
-from vslam.trajectory import read_trajectory
+from vslam.types.features import Extracted, Features, TrackingState
+from vslam.types.geometry import inverse, orthonormalised, se3_log
+from vslam.types.odometry import relative_covariance
+from vslam.types.trajectory import read_trajectory
 
 DARK = range(30, 50)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from vslam.geometry import (
+from vslam.types.geometry import (
     compose,
     inverse,
     inverses,

@@ -12,7 +12,7 @@ from test_bundle_adjustment import CAMERA, gtsam_graph, make_problem, pose_diffe
 
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.global_bundle_adjustment import adjust_globally, coupled_cameras
-from vslam.geometry import inverses, se3_exp, transform
+from vslam.types.geometry import inverses, se3_exp, transform
 
 
 def loop_problem(

@@ -8,8 +8,8 @@ from test_local_mapping import CAMERA, World, make_world
 from vslam.backend.bundle_adjustment import BundleSolution
 from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.global_mapping import connected_parts, merge_solution, take_snapshot
-from vslam.geometry import inverse, se3_exp, transform
-from vslam.map_kernels import link_many, merge_landmarks
+from vslam.types.geometry import inverse, se3_exp, transform
+from vslam.types.map_kernels import link_many, merge_landmarks
 
 
 def pose(k: int) -> np.ndarray:

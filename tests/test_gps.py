@@ -17,9 +17,9 @@ from vslam.backend.gps import Positions, align, anchor
 from vslam.backend.pose_graph import TREE, WEAK, PoseGraph, edge_sigmas
 from vslam.config import Config
 from vslam.datasets.fixes import DEFAULT_SIGMA_M, read_fixes, to_enu, to_geodetic
-from vslam.errors import InputError
-from vslam.geometry import inverses, se3_exp
-from vslam.trajectory import read_trajectory
+from vslam.support.errors import InputError
+from vslam.types.geometry import inverses, se3_exp
+from vslam.types.trajectory import read_trajectory
 
 DATUM = np.array([48.0, 11.0, 500.0])
 R_ENU_CAMERA = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

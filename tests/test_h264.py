@@ -10,7 +10,7 @@ import pytest
 from source_files import open_from, run_source, write_calibration
 
 from vslam.datasets.sources import SourceOptions
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 av = pytest.importorskip("av")
 

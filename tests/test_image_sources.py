@@ -10,8 +10,6 @@ import pytest
 from scipy.io import savemat
 from siamese_worlds import views
 
-from vslam.errors import InputError, UnreadableImageError
-from vslam.geometry import se3_exp
 from vslam.loopclosure.siamese.image_source import images_in, read_loop_matrix, undistorted
 from vslam.loopclosure.siamese.kitti_source import relation_of_poses
 from vslam.loopclosure.siamese.pack import write_pack
@@ -25,8 +23,10 @@ from vslam.loopclosure.training.data import (
     refuse_test_data,
     write_pairs,
 )
-from vslam.trajectory import write_kitti
-from vslam.untrusted import is_image
+from vslam.support.errors import InputError, UnreadableImageError
+from vslam.support.untrusted import is_image
+from vslam.types.geometry import se3_exp
+from vslam.types.trajectory import write_kitti
 
 
 def write_image(path, grey=100, size=(48, 32)):

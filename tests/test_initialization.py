@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vslam.camera import Camera
 from vslam.config import InitializationConfig
 from vslam.frontend.initialization import (
     motions_of_essential,
@@ -13,7 +12,8 @@ from vslam.frontend.initialization import (
     reconstruct,
     select_model,
 )
-from vslam.geometry import inverse, se3_exp, transform
+from vslam.types.camera import Camera
+from vslam.types.geometry import inverse, se3_exp, transform
 
 CAMERA = Camera(500.0, 500.0, 320.0, 240.0, 0.0, 640, 480)
 CONFIG = InitializationConfig()

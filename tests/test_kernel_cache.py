@@ -10,15 +10,15 @@ from pathlib import Path
 import numba
 import pytest
 
-from vslam.kernels import _CheckedFiles
+from vslam.support.kernels import _CheckedFiles
 
 # A separate process prints the loaded modules of Numba's compiler, and then the result.
 INNER = """
 import sys
 import numpy as np
 from numba.core import types
-from vslam import kernels
-from vslam.kernels import inner_kernel, kernel
+from vslam.support import kernels
+from vslam.support.kernels import inner_kernel, kernel
 
 @inner_kernel
 def total(values, first):
@@ -36,7 +36,7 @@ def both(values):
 OUTER = """
 from inner import both, total
 import numpy as np
-from vslam.kernels import kernel
+from vslam.support.kernels import kernel
 
 @kernel
 def three(values, first):
@@ -92,14 +92,14 @@ def test_the_installed_release_of_numba_is_known() -> None:
 
     For a new release, check that ``_KernelCache`` still works.
     """
-    from vslam.kernels import TESTED_NUMBA
+    from vslam.support.kernels import TESTED_NUMBA
 
     assert numba.__version__.startswith(TESTED_NUMBA)
 
 
 @pytest.mark.slow
 def test_an_unknown_release_uses_its_own_cache(tmp_path: Path) -> None:
-    (tmp_path / "inner.py").write_text(INNER.replace("from vslam.kernels", UNKNOWN, 1))
+    (tmp_path / "inner.py").write_text(INNER.replace("from vslam.support.kernels", UNKNOWN, 1))
     for hits in "01":
         assert run(tmp_path, "-c", CALL)[0] == f"6.0 [0.0, 1.0, 2.0, 3.0] {hits}"
 
@@ -154,9 +154,11 @@ def test_kernels_that_do_not_fit_on_the_disk(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("numba_of", ["from vslam.kernels", "UNKNOWN"])
+@pytest.mark.parametrize("numba_of", ["from vslam.support.kernels", "UNKNOWN"])
 def test_an_installation_without_a_writable_folder(tmp_path: Path, numba_of: str) -> None:
-    source = INNER if numba_of != "UNKNOWN" else INNER.replace("from vslam.kernels", UNKNOWN, 1)
+    source = (
+        INNER if numba_of != "UNKNOWN" else INNER.replace("from vslam.support.kernels", UNKNOWN, 1)
+    )
     (tmp_path / "inner.py").write_text(source)
     (tmp_path / "__pycache__").touch()  # not even root can make a folder here
     nowhere = {name: "/dev/null/none" for name in ("NUMBA_CACHE_DIR", "HOME", "XDG_CACHE_HOME")}
@@ -169,4 +171,4 @@ def test_an_installation_without_a_writable_folder(tmp_path: Path, numba_of: str
 
 
 UNKNOWN = """kernels.TESTED_NUMBA = "unknown"
-from vslam.kernels"""
+from vslam.support.kernels"""

@@ -9,7 +9,6 @@ import pytest
 from parts import CAMERA, Points
 
 from vslam.config import Config, KeyframeConfig
-from vslam.context import Context
 from vslam.frontend.keyframes import (
     KeyframeEvidence,
     KeyframePolicy,
@@ -18,6 +17,7 @@ from vslam.frontend.keyframes import (
     needs_monocular_keyframe,
 )
 from vslam.frontend.track import Track
+from vslam.types.context import Context
 
 CONFIG = KeyframeConfig(
     max_interval_s=1.0,

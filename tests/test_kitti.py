@@ -11,7 +11,7 @@ import pytest
 
 from vslam.datasets import open_sequence
 from vslam.datasets.kitti import list_kitti, open_kitti
-from vslam.errors import InputError, UnreadableImageError
+from vslam.support.errors import InputError, UnreadableImageError
 
 REAL = Path(__file__).parents[2] / "shared/data/kitti"
 WIDTH, HEIGHT, FRAMES = 64, 32, 6

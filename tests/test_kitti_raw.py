@@ -12,7 +12,7 @@ import pytest
 from vslam.datasets.fixes import read_fixes
 from vslam.datasets.kitti_raw import open_kitti_raw
 from vslam.datasets.sources import SourceOptions, open_source
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 SIZE, RAW_SIZE, FRAMES = (64, 32), (72, 40), 4
 DRIVE = "2011_09_26_drive_0005_sync"

@@ -6,10 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vslam.camera import Camera
 from vslam.config import Config
-from vslam.features import Features
-from vslam.geometry import inverse, se3_exp, transform
 from vslam.loopclosure.learned_verification import (
     LearnedRelocalisation,
     is_image_redundant,
@@ -20,9 +17,12 @@ from vslam.loopclosure.learned_verification import (
 )
 from vslam.loopclosure.local_matching import DescriptorMaps
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
-from vslam.loops import LastSeen, LoopCandidate
-from vslam.map import Map
-from vslam.map_kernels import link_many
+from vslam.types.camera import Camera
+from vslam.types.features import Features
+from vslam.types.geometry import inverse, se3_exp, transform
+from vslam.types.loops import LastSeen, LoopCandidate
+from vslam.types.map import Map
+from vslam.types.map_kernels import link_many
 
 CAMERA = Camera(400.0, 400.0, 320.0, 96.0, 0.5, 640, 192)
 DEPTH = 8.0

@@ -14,18 +14,18 @@ from parts import CAMERA
 from vslam.calibration.files import read_calibration
 from vslam.calibration.models import Calibration, CameraModel
 from vslam.calibration.rectification import rectify
-from vslam.camera import check_images
 from vslam.config import Config, load_config
 from vslam.datasets import open_sequence
 from vslam.datasets.image_folders import open_images
 from vslam.datasets.kitti import list_kitti
-from vslam.errors import InputError
 from vslam.evaluation.trajectories import read_pair
 from vslam.maps.formats import save_ply
 from vslam.maps.storage import load_map, made_with, map_file_of
 from vslam.report.finished_run import read_run
 from vslam.slam import Slam
-from vslam.trajectory import (
+from vslam.support.errors import InputError
+from vslam.types.camera import check_images
+from vslam.types.trajectory import (
     Trajectory,
     read_kitti_poses,
     read_trajectory,

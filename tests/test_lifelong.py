@@ -10,9 +10,9 @@ from ring import CAMERA, LAP, Oracle, Ring
 from test_closing import errors
 
 from vslam.config import Config
-from vslam.features import Extracted, Features
-from vslam.geometry import inverse
 from vslam.slam import Slam
+from vslam.types.features import Extracted, Features
+from vslam.types.geometry import inverse
 
 RING = Ring.create()
 PLACES = [float(k % LAP) for k in range(5 * LAP)]

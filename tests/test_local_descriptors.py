@@ -9,12 +9,12 @@ import torch
 from reference_local import LocalHead, LocalNetwork, doubled
 from safetensors.torch import load_file
 
-from vslam.errors import InputError
 from vslam.loopclosure.local_matching import positions
 from vslam.loopclosure.siamese import local_descriptors
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors, resized
 from vslam.loopclosure.siamese.weights import SHIPPED
 from vslam.loopclosure.training.siamese import load_network
+from vslam.support.errors import InputError
 
 
 @pytest.fixture(scope="module")

@@ -28,12 +28,12 @@ from vslam.backend.triangulation import (
     triangulate_pair,
     triangulate_with_neighbours,
 )
-from vslam.camera import Camera
 from vslam.config import Config, MappingConfig, StereoConfig
-from vslam.features import Features
-from vslam.geometry import inverse, se3_exp, se3_log, transform
-from vslam.map import Map
-from vslam.map_kernels import link_many
+from vslam.types.camera import Camera
+from vslam.types.features import Features
+from vslam.types.geometry import inverse, se3_exp, se3_log, transform
+from vslam.types.map import Map
+from vslam.types.map_kernels import link_many
 
 CAMERA = Camera(320.0, 320.0, 319.5, 119.5, 0.5, 640, 240)
 CONFIG = Config()

@@ -16,14 +16,14 @@ from typer.testing import CliRunner
 
 from vslam.cli.main import app
 from vslam.config import Config
-from vslam.errors import InputError, ResultsError
 from vslam.evaluation.map_alignment import name_of_world
-from vslam.features import Extracted, TrackingState, TrackResult
-from vslam.geometry import inverse
 from vslam.loopclosure.registry import create_detector
 from vslam.maps.storage import load_map, save_map
 from vslam.report import folder
 from vslam.slam import Slam
+from vslam.support.errors import InputError, ResultsError
+from vslam.types.features import Extracted, TrackingState, TrackResult
+from vslam.types.geometry import inverse
 
 CONFIG = Config()
 NOTHING = Extracted.nothing()

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from vslam.errors import InputError
-from vslam.lock_file import locked
+from vslam.support.errors import InputError
+from vslam.support.lock_file import locked
 
 
 def test_a_living_process_keeps_others_out(tmp_path):
@@ -32,7 +32,8 @@ def test_a_lock_is_given_back_after_an_error(tmp_path):
 def test_what_a_killed_process_left_is_passed_over(tmp_path):
     lock = tmp_path / ".lock"
     command = (
-        "import os, signal, sys; from pathlib import Path; from vslam.lock_file import locked\n"
+        "import os, signal, sys; from pathlib import Path\n"
+        "from vslam.support.lock_file import locked\n"
         "with locked(Path(sys.argv[1]), Path(), ''): os.kill(os.getpid(), signal.SIGKILL)"
     )
     subprocess.run([sys.executable, "-c", command, lock], check=False)
@@ -53,8 +54,8 @@ def test_a_change_of_the_clock_lets_nobody_in(tmp_path):
 RACER = """
 import sys, time
 from pathlib import Path
-from vslam.errors import InputError
-from vslam.lock_file import locked
+from vslam.support.errors import InputError
+from vslam.support.lock_file import locked
 
 folder = Path(sys.argv[1])
 entered = 0

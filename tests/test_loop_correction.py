@@ -7,8 +7,8 @@ import pytest
 from test_local_mapping import CAMERA, World, make_world
 
 from vslam.backend.loop_correction import move_keyframes
-from vslam.geometry import inverse, se3_exp, transform
-from vslam.map_kernels import refresh_landmarks
+from vslam.types.geometry import inverse, se3_exp, transform
+from vslam.types.map_kernels import refresh_landmarks
 
 POSES = [se3_exp(np.array([0.1 * k, 0.0, -0.6 * k, 0.0, 0.01 * k, 0.0])) for k in range(5)]
 

@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 import vslam.run.moments
-from vslam.camera import Camera
-from vslam.features import Features, TrackingState, TrackResult
-from vslam.loops import LoopEdge
-from vslam.map import Map
-from vslam.map_kernels import link, link_many, merge_landmarks
 from vslam.run.loop_pictures import LoopPicture, draw_picture, loop_matches, spread
 from vslam.run.moments import LoopPictureRecorder
+from vslam.types.camera import Camera
+from vslam.types.features import Features, TrackingState, TrackResult
+from vslam.types.loops import LoopEdge
+from vslam.types.map import Map
+from vslam.types.map_kernels import link, link_many, merge_landmarks
 
 CAMERA = Camera(100.0, 100.0, 100.0, 50.0, 0.5, 200, 100)
 MATCH, NEIGHBOUR, QUERY = 0, 1, 2

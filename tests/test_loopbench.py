@@ -20,7 +20,6 @@ from typer.testing import CliRunner
 
 from vslam.cli.main import app
 from vslam.datasets.synthetic import store
-from vslam.errors import InputError
 from vslam.lab.loopbench import report as reporting
 from vslam.lab.loopbench.conditions import Condition, apply, clipped, parse_conditions, turned
 from vslam.lab.loopbench.cost import cost
@@ -41,6 +40,7 @@ from vslam.lab.loopbench.sets import QuerySet, TestSet, open_set
 from vslam.loopclosure.precision_recall import average_precision, precision_recall
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
 from vslam.loopclosure.vocabulary import load
+from vslam.support.errors import InputError
 
 
 @contextmanager

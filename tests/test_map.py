@@ -7,10 +7,10 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from vslam.features import Features
-from vslam.geometry import se3_exp
-from vslam.map import KEYFRAME_FIELDS, LANDMARK_FIELDS, PREDICTED, ROW_FIELDS, Map
-from vslam.map_kernels import (
+from vslam.types.features import Features
+from vslam.types.geometry import se3_exp
+from vslam.types.map import KEYFRAME_FIELDS, LANDMARK_FIELDS, PREDICTED, ROW_FIELDS, Map
+from vslam.types.map_kernels import (
     collect_landmarks,
     count_seen_by,
     erase_landmark,
@@ -23,7 +23,7 @@ from vslam.map_kernels import (
     resolve,
     unlink,
 )
-from vslam.map_view import NO_LANDMARKS, local_map
+from vslam.types.map_view import NO_LANDMARKS, local_map
 
 SCALES = 1.2 ** np.arange(8)
 

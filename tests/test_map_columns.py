@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
-from vslam.features import Features
-from vslam.map import (
+from vslam.maps.storage import load_map, save_map
+from vslam.maps.stored_map import StoredMap, appended, selected
+from vslam.types.camera import Camera
+from vslam.types.features import Features
+from vslam.types.map import (
     KEYFRAME_FIELDS,
     LANDMARK_FIELDS,
     PREDICTED,
@@ -23,9 +25,7 @@ from vslam.map import (
     Map,
     Scalars,
 )
-from vslam.map_kernels import link_many
-from vslam.maps.storage import load_map, save_map
-from vslam.maps.stored_map import StoredMap, appended, selected
+from vslam.types.map_kernels import link_many
 
 CAMERA = Camera(fx=100.0, fy=100.0, cx=50.0, cy=50.0, width=100, height=100, baseline=0.5)
 N, PER = 7, 4  # keyframes, and keypoints of each

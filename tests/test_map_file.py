@@ -17,18 +17,18 @@ import valid_files
 from ring import CAMERA, Ring
 
 from vslam.config import Config, OrbConfig
-from vslam.errors import InputError
-from vslam.features import Extracted, Features
-from vslam.geometry import se3_exp
 from vslam.loopclosure.registry import create_detector, create_images
-from vslam.loops import LoopEdge, PerKeyframe
-from vslam.map import UNPREDICTED, Map
-from vslam.map_kernels import refresh_landmarks
 from vslam.maps import new_output
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
-from vslam.revisits import Revisits
 from vslam.slam import Slam
+from vslam.support.errors import InputError
+from vslam.types.features import Extracted, Features
+from vslam.types.geometry import se3_exp
+from vslam.types.loops import LoopEdge, PerKeyframe
+from vslam.types.map import UNPREDICTED, Map
+from vslam.types.map_kernels import refresh_landmarks
+from vslam.types.revisits import Revisits
 
 CONFIG = Config()
 

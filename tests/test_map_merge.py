@@ -10,18 +10,18 @@ import pytest
 from ring import CAMERA, LAP, Ring
 from typer.testing import CliRunner
 
-from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import Config
-from vslam.errors import InputError
-from vslam.features import Extracted
-from vslam.geometry import inverse, inverses
 from vslam.loopclosure.registry import create_detector
-from vslam.loops import PerKeyframe
 from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap, appended, in_box, near_frames, near_point
-from vslam.merging import merge_maps
+from vslam.method.merging import merge_maps
 from vslam.slam import Slam
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera
+from vslam.types.features import Extracted
+from vslam.types.geometry import inverse, inverses
+from vslam.types.loops import PerKeyframe
 
 CONFIG = Config()
 

@@ -10,28 +10,28 @@ import pytest
 import ring
 from parts import CAMERA, InstantWorkers, Points, ahead, frame_of
 
-from vslam.camera import Camera
-from vslam.closing import LoopSearch
 from vslam.config import Config
-from vslam.context import Context
-from vslam.features import PATCH_PIXELS, Extracted, Features, KeyframePatches, TrackingState
 from vslam.frontend.orb import build_pyramid
 from vslam.frontend.patches import patches_around
 from vslam.frontend.rig import with_offset
 from vslam.frontend.track import Track
 from vslam.frontend.tracking import track_local_map
-from vslam.geometry import inverse, se3_exp
 from vslam.loopclosure.detector import NoDetector
-from vslam.map import Map
-from vslam.map_frames import add_revisit
-from vslam.map_kernels import erase_landmark
-from vslam.map_view import MapView
-from vslam.mapping import Mapper
-from vslam.revisits import MAX_REVISITS
+from vslam.method.closing import LoopSearch
+from vslam.method.map_frames import add_revisit
+from vslam.method.mapping import Mapper
+from vslam.method.starter import TwoViewStart
 from vslam.slam import Slam
-from vslam.starter import TwoViewStart
-from vslam.states import MapperState
-from vslam.workers import Workers
+from vslam.support.workers import Workers
+from vslam.types.camera import Camera
+from vslam.types.context import Context
+from vslam.types.features import PATCH_PIXELS, Extracted, Features, KeyframePatches, TrackingState
+from vslam.types.geometry import inverse, se3_exp
+from vslam.types.map import Map
+from vslam.types.map_kernels import erase_landmark
+from vslam.types.map_view import MapView
+from vslam.types.revisits import MAX_REVISITS
+from vslam.types.states import MapperState
 
 POINTS = Points.create()
 RING = ring.Ring.create(zoom=True)
@@ -691,7 +691,7 @@ def test_a_map_that_is_incomplete_is_not_saved(failing, threads, tmp_path, monke
 
     # The first keyframe is mapped at once, the others by a job.
     function = "map_and_calibrate" if failing else "map_stereo_points"
-    monkeypatch.setattr(f"vslam.mapping.{function}", fail)
+    monkeypatch.setattr(f"vslam.method.mapping.{function}", fail)
     path = tmp_path / "map.npz"
     path.write_bytes(b"an older map")
     slam = Slam(CAMERA, detector="none", threads=threads)

@@ -12,19 +12,19 @@ import pytest
 from source_files import open_from, write_calibration, write_images, write_video
 
 from vslam.config import Config
-from vslam.context import Context
-from vslam.errors import InputError, UnreadableImageError
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.features import TrackingState
 from vslam.frontend import tracker
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.masks import REACH, Mask
 from vslam.frontend.pose_alignment import align_pose
-from vslam.geometry import transform
 from vslam.report.finished_run import open_images, read_run
 from vslam.run.preparation import prepare_frame
 from vslam.slam import Slam
-from vslam.trajectory import Trajectory
+from vslam.support.errors import InputError, UnreadableImageError
+from vslam.types.context import Context
+from vslam.types.features import TrackingState
+from vslam.types.geometry import transform
+from vslam.types.trajectory import Trajectory
 
 ORB = Config().orb
 HOOD = 110  # first row that the hood covers

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vslam.features import CELL, FeatureGrid, nearest_features
 from vslam.frontend.matching import (
     Projections,
     Searchable,
@@ -14,8 +13,9 @@ from vslam.frontend.matching import (
     search_all,
     search_windows,
 )
-from vslam.kernels import hamming as hamming_intrinsic
-from vslam.kernels import kernel
+from vslam.support.kernels import hamming as hamming_intrinsic
+from vslam.support.kernels import kernel
+from vslam.types.features import CELL, FeatureGrid, nearest_features
 
 WIDTH, HEIGHT = 330, 170  # not multiples of a cell
 

@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from vslam.datasets import bag_limits
 from vslam.datasets.bag import open_bag
-from vslam.errors import BrokenSourceError, InputError
+from vslam.support.errors import BrokenSourceError, InputError
 
 
 def record_pair(recorder: Recorder, corridor, n: int = 3, kind: str = "CompressedImage") -> None:

@@ -2,7 +2,7 @@
 
 There are three reference clips: a stereo corridor, the same corridor as RGB-D, and a drive round a
 block whose loop is closed by night. After a change of the method, raise ``METHOD_VERSION`` in
-``vslam/method.py`` and write the references again with ``make method``.
+``vslam/method/version.py`` and write the references again with ``make method``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from conftest import corridor_depth
 from numpy.typing import NDArray
 
 from vslam import METHOD_VERSION, Slam
-from vslam.camera import Camera
+from vslam.types.camera import Camera
 
 REFERENCES = Path(__file__).parent / "method_references.npz"
 WRITE = "WRITE_METHOD_REFERENCES"  # environment variable
@@ -75,7 +75,7 @@ def test_the_version_of_the_method_is_that_of_its_trajectories(name, clips):
     limit = LIMIT_M if references["made_on"] == here else LIMIT_ELSEWHERE_M
     assert references["version"] == METHOD_VERSION, "run make method"
     assert far < limit, (
-        f"the clip {name} moved by {far:.2g} m: raise METHOD_VERSION in vslam/method.py, "
+        f"the clip {name} moved by {far:.2g} m: raise METHOD_VERSION in vslam/method/version.py, "
         "then run make method"
     )
 

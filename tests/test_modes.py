@@ -9,13 +9,13 @@ import pytest
 from parts import CAMERA, Points, ahead
 from test_mapper import Drive, at, begin_with_two_views, bytes_of_map, see_points, see_without_depth
 
-from vslam.camera import Camera
-from vslam.features import TrackingState
 from vslam.frontend.track import By, GivenFeatures, Prediction, Track
 from vslam.frontend.tracker import Tracker
-from vslam.map_frames import OldPlace
-from vslam.modes import Building, Localising
-from vslam.states import PolicyState, Standstill
+from vslam.method.map_frames import OldPlace
+from vslam.method.modes import Building, Localising
+from vslam.types.camera import Camera
+from vslam.types.features import TrackingState
+from vslam.types.states import PolicyState, Standstill
 
 POINTS = Points.create()
 TWIST = np.array([0.0, 0.0, -2.0, 0.0, 0.0, 0.0])

@@ -10,9 +10,9 @@ import pytest
 from ring import CAMERA, LAP, Oracle, Ring
 
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.features import Extracted, Features, TrackingState
 from vslam.slam import Slam
-from vslam.trajectory import Trajectory
+from vslam.types.features import Extracted, Features, TrackingState
+from vslam.types.trajectory import Trajectory
 
 LEFT_CAMERA = CAMERA.left_camera()
 RING = Ring.create()

@@ -7,10 +7,10 @@ import pytest
 
 from vslam.config import Config
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.features import TrackingState
 from vslam.frontend.motion_time import RECENT, motion_seconds
 from vslam.slam import Slam
-from vslam.trajectory import Trajectory
+from vslam.types.features import TrackingState
+from vslam.types.trajectory import Trajectory
 
 
 def times(milliseconds) -> np.ndarray:

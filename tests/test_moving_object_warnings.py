@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vslam.features import TrackingState, TrackResult
 from vslam.run.moving_objects import moving_object_warnings
+from vslam.types.features import TrackingState, TrackResult
 
 
 def tracks_with(support: list[float | None]) -> list[TrackResult]:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from conftest import corridor_mipmaps, render
 
-from vslam.camera import Camera
 from vslam.config import Config
-from vslam.features import TrackingState, TrackResult
 from vslam.slam import Slam
+from vslam.types.camera import Camera
+from vslam.types.features import TrackingState, TrackResult
 
 CAMERA = Camera(240.0, 240.0, 239.5, 99.5, 0.5, 480, 200)
 DISPARITY = 15  # of the vehicles, which are 8 m away

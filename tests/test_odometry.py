@@ -17,10 +17,16 @@ from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import Perturbation
 from vslam.datasets.synthetic import built_in_route
 from vslam.evaluation.odometry import motion_errors
-from vslam.features import Extracted, TrackingState, TrackResult
 from vslam.frontend.pose import offset_effect, optimise_pose, pose_covariance
-from vslam.geometry import adjoint, inverse, se3_exp, se3_log
-from vslam.odometry import (
+from vslam.report.figures import draw_figures
+from vslam.report.frame_table import write_covariances, write_frames
+from vslam.run.options import RunOptions
+from vslam.run.pipeline import run_sequence
+from vslam.run.recorder import Recorder
+from vslam.slam import Slam
+from vslam.types.features import Extracted, TrackingState, TrackResult
+from vslam.types.geometry import adjoint, inverse, se3_exp, se3_log
+from vslam.types.odometry import (
     CORRELATION,
     DRIFT,
     Odometry,
@@ -28,13 +34,7 @@ from vslam.odometry import (
     predicted_covariance,
     relative_covariance,
 )
-from vslam.report.figures import draw_figures
-from vslam.report.frame_table import write_covariances, write_frames
-from vslam.run.options import RunOptions
-from vslam.run.pipeline import run_sequence
-from vslam.run.recorder import Recorder
-from vslam.slam import Slam
-from vslam.trajectory import Trajectory
+from vslam.types.trajectory import Trajectory
 
 MOTION = se3_exp(np.array([0.1, -0.05, -1.0, 0.01, 0.05, -0.02]))
 

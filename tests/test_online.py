@@ -17,7 +17,6 @@ from typer.testing import CliRunner
 
 from vslam.cli.main import app
 from vslam.datasets.synthetic import store
-from vslam.errors import InputError
 from vslam.lab.loopbench import report as reporting
 from vslam.lab.loopbench.drives import open_drives
 from vslam.lab.loopbench.measure_online import measure_drive
@@ -40,6 +39,7 @@ from vslam.loopclosure.siamese.image_source import (
 )
 from vslam.loopclosure.siamese.source_registry import open_source
 from vslam.loopclosure.vocabulary import load
+from vslam.support.errors import InputError
 
 TRUTH = Path(__file__).parents[2] / "shared/data/loop_ground_truth"
 

@@ -19,7 +19,6 @@ from rich.console import Console
 from vslam import METHOD_VERSION
 from vslam.cli import main as cli
 from vslam.config import Config
-from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.lab.overview import figures
 from vslam.lab.overview.collect import Found, collect, read_aligned
@@ -37,7 +36,8 @@ from vslam.lab.overview.versus import versus
 from vslam.report.page import Table
 from vslam.report.render import show
 from vslam.report.schema import DetectorFigures
-from vslam.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
+from vslam.support.errors import InputError
+from vslam.types.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
 
 LAWS = ("none", "brightness:0.5", "brightness:1")
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from vslam.errors import InputError, ResultsError
 from vslam.report.drawing import LOW, Drawing, add_legend, draw, new_figure
 from vslam.report.page import (
     Alert,
@@ -26,6 +25,7 @@ from vslam.report.page import (
 )
 from vslam.report.render import csv_text, html, markdown, show, write_files
 from vslam.report.schema import Document
+from vslam.support.errors import InputError, ResultsError
 
 JPEG = b"\xff\xd8\xff"
 TABLE = Table(("what", "ATE (m), bow"), [("a | b", "1.0"), ("<b>", "12.5")], ("what",), "Medians.")

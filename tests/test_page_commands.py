@@ -26,7 +26,7 @@ from conftest import corridor_depth
 from source_files import write_bag, write_calibration, write_images, write_video
 from stub_runner import wait_for
 
-from vslam.trajectory import write_kitti
+from vslam.types.trajectory import write_kitti
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -15,9 +15,9 @@ from vslam.datasets.frames import Source, TimedFrame, stored_frames
 from vslam.datasets.image_files import same_images
 from vslam.datasets.image_folders import open_images
 from vslam.datasets.names import pair_names
-from vslam.errors import InputError, UnreadableImageError
 from vslam.run.options import RunOptions
 from vslam.run.pair import PairCheck, how_to_swap
+from vslam.support.errors import InputError, UnreadableImageError
 
 RNG = np.random.default_rng(0)
 N = 30

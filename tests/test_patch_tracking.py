@@ -10,11 +10,8 @@ import numpy as np
 import pytest
 
 from vslam.config import Config
-from vslam.context import Context
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import Perturbation
-from vslam.errors import UnreadableImageError
-from vslam.features import Extracted, TrackingState
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.orb import build_pyramid, level_shapes
 from vslam.frontend.patch_tracking import track_patches
@@ -22,11 +19,14 @@ from vslam.frontend.pose_alignment import align_pose, coarse_levels, coarse_pyra
 from vslam.frontend.track import GivenFeatures
 from vslam.frontend.tracker import Tracker
 from vslam.frontend.tracking import feature_depth
-from vslam.geometry import inverse, se3_exp, se3_log, transform
 from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
+from vslam.support.errors import UnreadableImageError
+from vslam.types.context import Context
+from vslam.types.features import Extracted, TrackingState
+from vslam.types.geometry import inverse, se3_exp, se3_log, transform
 
 CONFIG = Config.model_validate({"tracking": {"method": "patches"}})
 FEATURES = Config.model_validate({"tracking": {"method": "orb"}})

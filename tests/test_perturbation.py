@@ -6,10 +6,10 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from vslam.camera import Camera
 from vslam.datasets.frames import Source, TimedFrame, stored_frames
 from vslam.datasets.perturbation import contact_sheet, ou_walk, parse_perturbation, perturbed
-from vslam.errors import InputError
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera
 
 TIMES = 0.1 * np.arange(300)
 LAWS = ("brightness", "gamma", "flicker", "noise", "blur", "occlusion")

@@ -9,7 +9,6 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from vslam.camera import Camera, ImageMap
 from vslam.datasets.frames import Source, stored_frames
 from vslam.datasets.perturbation import LAWS, Scene, laws_for, parse_perturbation
 from vslam.datasets.perturbation.depth import dense_depths, disparity
@@ -17,7 +16,8 @@ from vslam.datasets.perturbation.kinds import Pair
 from vslam.datasets.perturbation.light import FULL_WELL, READ_NOISE
 from vslam.datasets.perturbation.motion import line_kernel
 from vslam.datasets.perturbation.weather import AIRLIGHT, drops_per_m3, glass_drops
-from vslam.errors import DroppedFrameError, InputError
+from vslam.support.errors import DroppedFrameError, InputError
+from vslam.types.camera import Camera, ImageMap
 
 CAMERA = Camera(400.0, 400.0, 160.0, 80.0, 0.5, 320, 160)
 RATE = 0.4  # rad/s, to the right

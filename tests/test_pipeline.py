@@ -22,12 +22,9 @@ import numpy as np
 import pytest
 
 from vslam.config import Config
-from vslam.context import Context
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import parse_perturbation, perturbed
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.features import TrackingState
-from vslam.loops import LoopEdge
 from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
 from vslam.run.options import RunOptions
@@ -35,7 +32,10 @@ from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import _record_loops, mistracked_warnings, run_sequence
 from vslam.run.preparation import prepare_frame
 from vslam.run.recorder import Recorder
-from vslam.trajectory import Trajectory, read_kitti_poses
+from vslam.types.context import Context
+from vslam.types.features import TrackingState
+from vslam.types.loops import LoopEdge
+from vslam.types.trajectory import Trajectory, read_kitti_poses
 
 KITTI = Path(__file__).parents[2] / "shared" / "data" / "kitti"
 needs_kitti = pytest.mark.skipif(not KITTI.is_dir(), reason="KITTI is not at ../shared/data")

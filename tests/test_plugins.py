@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 from source_files import open_from
 
-from vslam import plugins
 from vslam.cli import main as cli
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import Perturbation, parse_perturbation
-from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
-from vslam.features import Features
 from vslam.loopclosure.registry import create_detector, problem_of, require_detector
-from vslam.map import Map
 from vslam.report.folder import create_run_folder, write_results
 from vslam.run.options import RunOptions, read_options
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.support import plugins
+from vslam.support.errors import BrokenSourceError, InputError, UnreadableImageError
+from vslam.types.features import Features
+from vslam.types.map import Map
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "howto" / "plugins.md"
@@ -328,7 +328,7 @@ def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path,
 def test_candidates_that_are_none_are_caught_before_kernels_see_them(broken, answer, says):
     source = FAILING.replace("map_): return []", f"map_): return {answer}", 1)
     broken(
-        f"from vslam.loops import LoopCandidate\n{source}",
+        f"from vslam.types.loops import LoopCandidate\n{source}",
         "[vslam.detectors]\nmine = broken:Detector\n",
     )
     map_ = Map(np.array([1.0]))
@@ -407,7 +407,7 @@ def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
     ("change", "says"),
     [
         (("return Source", "return dict"), "returned dict, not vslam.datasets.frames.Source"),
-        (("camera=inner.camera", "camera=3"), "camera is int, not vslam.camera.Camera"),
+        (("camera=inner.camera", "camera=3"), "camera is int, not vslam.types.camera.Camera"),
         (("live=LIVE", "n_expected=-1"), "n_expected is -1, neither None nor a number"),
         (
             ("play=play", "stored=(__import__('types').SimpleNamespace(timestamp=0.0),)"),

@@ -13,7 +13,7 @@ import pytest
 
 from vslam.datasets.image_files import check_not_empty, read_grey
 from vslam.datasets.png import SIGNATURE, decode_png, is_cut_off
-from vslam.errors import UnreadableImageError
+from vslam.support.errors import UnreadableImageError
 
 
 def picture(height, width):

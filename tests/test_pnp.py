@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from stereo_noise import white_noise
 
-from vslam.camera import Camera
 from vslam.frontend.pnp import ransac_pose, solve_p3p
-from vslam.geometry import inverse, se3_exp, se3_log, transform
+from vslam.types.camera import Camera
+from vslam.types.geometry import inverse, se3_exp, se3_log, transform
 
 CAMERA = Camera(718.0, 718.0, 607.0, 185.0, 0.54, 1241, 376)
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from stereo_noise import WHITENING, white_noise
 
-from vslam.camera import Camera
 from vslam.frontend.pose import optimise_pose
-from vslam.geometry import inverse, se3_exp, se3_log, solve_positive, transform
+from vslam.types.camera import Camera
+from vslam.types.geometry import inverse, se3_exp, se3_log, solve_positive, transform
 
 CAMERA = Camera(400.0, 410.0, 320.0, 120.0, 0.5, 640, 240)
 TRUTH = se3_exp(np.array([0.4, -0.2, 1.1, 0.05, -0.1, 0.02]))

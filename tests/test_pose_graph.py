@@ -21,11 +21,11 @@ from vslam.backend.pose_graph import (
     optimise,
 )
 from vslam.config import PoseGraphConfig
-from vslam.features import Features
-from vslam.geometry import inverse, inverses, orthonormalised, se3_exp, se3_log
-from vslam.loops import LoopEdge, reversed_loop
-from vslam.map import UNPREDICTED, Map
-from vslam.map_kernels import covisible_pairs, link_many
+from vslam.types.features import Features
+from vslam.types.geometry import inverse, inverses, orthonormalised, se3_exp, se3_log
+from vslam.types.loops import LoopEdge, reversed_loop
+from vslam.types.map import UNPREDICTED, Map
+from vslam.types.map_kernels import covisible_pairs, link_many
 
 CONFIG = PoseGraphConfig()
 

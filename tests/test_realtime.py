@@ -18,12 +18,12 @@ from vslam.config import Config, OrbConfig
 from vslam.datasets import open_sequence
 from vslam.datasets.frames import TimedFrame
 from vslam.datasets.perturbation import Perturbation
-from vslam.features import TrackingState
 from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.preparation import play
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
+from vslam.types.features import TrackingState
 
 
 def cameras() -> list[str]:

@@ -12,8 +12,8 @@ from conftest import StereoSequence, corridor_depth
 
 from vslam import Slam
 from vslam.config import Config
-from vslam.loops import LoopEdge
-from vslam.trajectory import read_trajectory
+from vslam.types.loops import LoopEdge
+from vslam.types.trajectory import read_trajectory
 
 PAGE = Path(__file__).parents[1] / "docs/howto/python.md"
 SECTION = re.compile(r"^## (.*?)\n(.*?)(?=^## |\Z)", re.DOTALL | re.MULTILINE)

@@ -18,11 +18,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
-from vslam.errors import InputError
-from vslam.features import Features, TrackingState, TrackResult
-from vslam.loops import LoopEdge
-from vslam.map import Map
 from vslam.run import recorder as recorder_module
 from vslam.run.moments import LoopPictureRecorder
 from vslam.run.recorder import (
@@ -31,7 +26,12 @@ from vslam.run.recorder import (
     SeveralRecorders,
     open_viewer,
 )
-from vslam.trajectory import Trajectory
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera
+from vslam.types.features import Features, TrackingState, TrackResult
+from vslam.types.loops import LoopEdge
+from vslam.types.map import Map
+from vslam.types.trajectory import Trajectory
 
 pytest.importorskip("rerun.chunk", reason="this rerun cannot read recordings in Python")
 

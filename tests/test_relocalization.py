@@ -9,12 +9,12 @@ from test_local_mapping import CAMERA, World, make_world
 from test_verification import forward, in_strip, link_pass
 
 from vslam.config import Config, RelocalizationConfig
-from vslam.context import Context
-from vslam.features import Extracted, Features
 from vslam.frontend.relocaliser import relocalised
 from vslam.frontend.track import Track
-from vslam.geometry import inverse, se3_log
-from vslam.map_view import NO_LANDMARKS, local_map
+from vslam.types.context import Context
+from vslam.types.features import Extracted, Features
+from vslam.types.geometry import inverse, se3_log
+from vslam.types.map_view import NO_LANDMARKS, local_map
 
 CONTEXT = Context.create(CAMERA, Config())
 KEYFRAMES = 4

@@ -13,12 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.config import Config, load_config
 from vslam.evaluation.loops import evaluate_loops
 from vslam.evaluation.trajectories import evaluate_trajectory, read_pair
-from vslam.features import TrackingState, TrackResult
-from vslam.loops import LoopCorrection, LoopEdge
 from vslam.report.folder import write_results
 from vslam.report.run_page import headlines
 from vslam.report.schema import DetectorFigures, ReportJson
@@ -27,7 +24,10 @@ from vslam.report.trajectory_figures import loop_closing, top_view
 from vslam.run.loop_pictures import LoopPicture
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
-from vslam.trajectory import Trajectory, read_trajectory, write_tum
+from vslam.types.camera import Camera
+from vslam.types.features import TrackingState, TrackResult
+from vslam.types.loops import LoopCorrection, LoopEdge
+from vslam.types.trajectory import Trajectory, read_trajectory, write_tum
 
 FIGURES = {
     "top_view",

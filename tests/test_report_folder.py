@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from test_report import CAMERA, make_outcome
 
-from vslam.camera import Camera
-from vslam.errors import InputError, ResultsError
-from vslam.map import Map
 from vslam.maps.storage import load_map
 from vslam.maps.stored_map import StoredMap
 from vslam.report import explorer, figures, folder, render
 from vslam.report.folder import Results, create_run_folder, write_results, write_trajectories
-from vslam.trajectory import Trajectory, read_kitti_poses, read_trajectory
+from vslam.support.errors import InputError, ResultsError
+from vslam.types.camera import Camera
+from vslam.types.map import Map
+from vslam.types.trajectory import Trajectory, read_kitti_poses, read_trajectory
 
 
 def test_name_and_latest(tmp_path):

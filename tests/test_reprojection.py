@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from stereo_noise import WHITENING, white_noise
 
-from vslam.camera import Camera
-from vslam.kernels import kernel
-from vslam.reprojection import (
+from vslam.support.kernels import kernel
+from vslam.types.camera import Camera
+from vslam.types.reprojection import (
     CHI2_MONO,
     CHI2_STEREO,
     chi_square,

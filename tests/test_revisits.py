@@ -10,12 +10,12 @@ from test_local_mapping import CAMERA, make_world
 
 from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.global_mapping import merge_solution, take_snapshot
-from vslam.geometry import inverse, se3_exp
-from vslam.map import revisits_of_living
-from vslam.map_frames import sees_old_place
-from vslam.map_kernels import link_many
 from vslam.maps.stored_map import StoredMap, appended, selected
-from vslam.revisits import Revisits
+from vslam.method.map_frames import sees_old_place
+from vslam.types.geometry import inverse, se3_exp
+from vslam.types.map import revisits_of_living
+from vslam.types.map_kernels import link_many
+from vslam.types.revisits import Revisits
 
 
 def seen_from(world, keyframe: int, T_cw: np.ndarray, noise: float = 0.0) -> Revisits:

@@ -11,10 +11,8 @@ import pytest
 from conftest import StereoSequence, corridor_depth
 from source_files import run_source
 
-from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import Config, DepthConfig, KeyframeConfig
-from vslam.context import Context
 from vslam.datasets import open_sequence
 from vslam.datasets.association import Pairing, associate
 from vslam.datasets.perturbation import parse_perturbation
@@ -22,7 +20,6 @@ from vslam.datasets.synthetic.layouts import render_rgbd
 from vslam.datasets.synthetic.routes import built_in_route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.tum import open_tum
-from vslam.errors import InputError, UnreadableImageError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.extraction import FrameImages
@@ -33,7 +30,10 @@ from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.slam import Slam
-from vslam.trajectory import Trajectory, write_kitti, write_tum
+from vslam.support.errors import InputError, UnreadableImageError
+from vslam.types.camera import Camera
+from vslam.types.context import Context
+from vslam.types.trajectory import Trajectory, write_kitti, write_tum
 
 REAL = Path(__file__).parents[2] / "shared/data/tum/rgbd_dataset_freiburg1_desk"
 SCALE = 1000.0

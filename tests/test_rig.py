@@ -11,14 +11,14 @@ from parts import frame_of
 from ring import CAMERA as RING_CAMERA
 from ring import LAP, Ring
 
-from vslam.camera import Camera
-from vslam.features import Extracted, Features
 from vslam.frontend.rig import RigMonitor, corrected, with_offset
 from vslam.frontend.sides import Sides
 from vslam.frontend.track import GivenFeatures
-from vslam.geometry import inverse, se3_exp
-from vslam.image_motion import columns_without_delay, rays
 from vslam.slam import Slam
+from vslam.types.camera import Camera
+from vslam.types.features import Extracted, Features
+from vslam.types.geometry import inverse, se3_exp
+from vslam.types.image_motion import columns_without_delay, rays
 
 CAMERA = Camera(300.0, 300.0, 200.0, 100.0, 0.5, 400, 200)
 # A car moves ahead, nods and turns.

@@ -19,11 +19,7 @@ from scipy.spatial.transform import Rotation
 from test_pipeline import run as run_pipeline
 from typer.testing import CliRunner
 
-from vslam.camera import Camera
 from vslam.cli.main import app
-from vslam.errors import InputError
-from vslam.features import TrackingState, TrackResult
-from vslam.geometry import inverse, se3_exp
 from vslam.maps.ros import (
     T_BASE_OPTICAL,
     TOPICS,
@@ -33,9 +29,13 @@ from vslam.maps.ros import (
     odometry_message,
 )
 from vslam.maps.storage import load_map
-from vslam.odometry import PoseUncertainty
 from vslam.report.folder import write_results
-from vslam.trajectory import read_trajectory
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera
+from vslam.types.features import TrackingState, TrackResult
+from vslam.types.geometry import inverse, se3_exp
+from vslam.types.odometry import PoseUncertainty
+from vslam.types.trajectory import read_trajectory
 
 ROOT = Path(__file__).parents[1]
 TRANSIENT_LOCAL = 1  # value in rmw's enum rmw_qos_durability_policy_t
@@ -192,7 +192,7 @@ def test_the_axes_are_those_of_rep_103():
 
 
 def test_covariances_are_those_of_errors_in_the_axes_of_ros():
-    """Errors are drawn as ``vslam.odometry`` defines them, and measured as ROS defines them.
+    """Errors are drawn as ``vslam.types.odometry`` defines them, and measured as ROS defines them.
 
     Errors of position and rotation are in the axes of odom. Errors of velocity are in the axes of
     base_link.

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from vslam.backend.global_bundle_adjustment import adjust_globally
-from vslam.map import NONE
+from vslam.types.map import NONE
 
 N = 200
 

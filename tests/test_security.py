@@ -23,13 +23,13 @@ from vslam.calibration.documents import read_document
 from vslam.datasets.bag import open_bag
 from vslam.datasets.image_files import read_grey
 from vslam.datasets.video import open_video
-from vslam.errors import InputError, UnreadableImageError
 from vslam.loopclosure.vocabulary import load
 from vslam.maps.storage import load_map
 from vslam.report.render import html
 from vslam.report.run_page import run_page
 from vslam.run.progress import read_progress
-from vslam.untrusted import MOST_PIXELS, read_npz
+from vslam.support.errors import InputError, UnreadableImageError
+from vslam.support.untrusted import MOST_PIXELS, read_npz
 
 ROOT = Path(__file__).parents[1]
 SOURCES = [
@@ -144,7 +144,7 @@ def test_images_of_absurd_size_are_refused_by_their_header(tmp_path: Path, width
         "import re, sys\n"
         "from pathlib import Path\n"
         "from vslam.datasets.image_files import read_grey\n"
-        "from vslam.errors import UnreadableImageError\n"
+        "from vslam.support.errors import UnreadableImageError\n"
         "try: read_grey(Path(sys.argv[1]))\n"
         "except UnreadableImageError as error: print(error)\n"
         # getrusage starts at the peak of the parent.

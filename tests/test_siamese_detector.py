@@ -19,12 +19,8 @@ from onnx import TensorProto, helper
 from siamese_worlds import small_network, small_settings, views
 from typer.testing import CliRunner
 
-from vslam.camera import Camera
 from vslam.cli.main import app
-from vslam.closing import LoopClosing
 from vslam.config import Config, SiameseConfig
-from vslam.errors import InputError, ResultsError
-from vslam.features import Features
 from vslam.lab.loopbench.detectors import NetworkScorer
 from vslam.loopclosure.reach import beyond_reach, within_reach
 from vslam.loopclosure.registry import detector_with_images
@@ -43,9 +39,13 @@ from vslam.loopclosure.training.export import (
 from vslam.loopclosure.training.preprocessing import to_tensor
 from vslam.loopclosure.training.siamese import for_inference, load_network
 from vslam.loopclosure.verifier import Verifier
-from vslam.loops import LastSeen
-from vslam.map import PREDICTED, UNPREDICTED, Map
-from vslam.map_kernels import link
+from vslam.method.closing import LoopClosing
+from vslam.support.errors import InputError, ResultsError
+from vslam.types.camera import Camera
+from vslam.types.features import Features
+from vslam.types.loops import LastSeen
+from vslam.types.map import PREDICTED, UNPREDICTED, Map
+from vslam.types.map_kernels import link
 
 
 def features(n: int) -> Features:
@@ -187,7 +187,7 @@ def test_a_late_network_is_loaded_by_the_first_image_and_missed_before(monkeypat
         "import sys\n"
         "import numpy as np\n"
         "from vslam.config import Config\n"
-        "from vslam.features import Features\n"
+        "from vslam.types.features import Features\n"
         "from vslam.loopclosure.registry import create_detector, create_images\n"
         "images = create_images('capsule', Config())\n"
         "detector = create_detector('capsule', Config(), None, images, late=True)\n"
@@ -455,7 +455,7 @@ def test_shipped_weights_know_a_place_again(name):
 def test_no_run_loads_torch():
     script = (
         "import sys\nimport numpy as np\nimport vslam.cli.main, vslam.run.pipeline\n"
-        "from vslam.config import Config\nfrom vslam.features import Features\n"
+        "from vslam.config import Config\nfrom vslam.types.features import Features\n"
         "from vslam.loopclosure.registry import create_detector\n"
         "detector = create_detector('capsule', Config())\n"
         "detector.add(0, np.zeros((188, 620), np.uint8), Features.none())\n"

@@ -10,16 +10,16 @@ import pytest
 from conftest import corridor_mipmaps, render
 from scipy.spatial.transform import Rotation
 
-from vslam.camera import Camera
 from vslam.config import Config
 from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.doctor.examine import examine
-from vslam.errors import UnreadableImageError
-from vslam.geometry import se3_exp
 from vslam.run.options import RunOptions
 from vslam.run.pair import PairCheck
 from vslam.run.side_delay import SideDelay, delay_warnings, fit_delay, measure_delay
+from vslam.support.errors import UnreadableImageError
+from vslam.types.camera import Camera
+from vslam.types.geometry import se3_exp
 
 CAMERA = Camera(240.0, 240.0, 159.5, 79.5, 0.5, 320, 160)
 CONFIG = Config().stereo

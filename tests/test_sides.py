@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from vslam.camera import Camera
 from vslam.config import Config
-from vslam.context import Context
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.sides import Sides, balanced, compare_sides, with_pair
-from vslam.geometry import inverse, se3_exp
 from vslam.run.rig import measure_offset, offset_warnings, rig_warnings
-from vslam.states import ComparedSides
+from vslam.types.camera import Camera
+from vslam.types.context import Context
+from vslam.types.geometry import inverse, se3_exp
+from vslam.types.states import ComparedSides
 
 CONFIG = Config().stereo
 CAMERA = Camera(300.0, 300.0, 200.0, 100.0, 0.5, 400, 200)

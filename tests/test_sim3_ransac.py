@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from stereo_noise import white_noise
 
-from vslam.camera import Camera
-from vslam.geometry import inverse, se3_exp, se3_log, symmetric_eigen, transform
 from vslam.loopclosure.sim3_ransac import (
     ObservedPoints,
     align,
@@ -15,7 +13,9 @@ from vslam.loopclosure.sim3_ransac import (
     is_degenerate,
     refine_motion,
 )
-from vslam.ransac import draw_three, draws_needed, random_index
+from vslam.support.ransac import draw_three, draws_needed, random_index
+from vslam.types.camera import Camera
+from vslam.types.geometry import inverse, se3_exp, se3_log, symmetric_eigen, transform
 
 CAMERA = Camera(718.0, 718.0, 607.0, 185.0, 0.54, 1241, 376)
 NOISE = 0.7  # pixels

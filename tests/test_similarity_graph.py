@@ -20,11 +20,11 @@ from vslam.backend.similarity_graph import (
     similarity,
 )
 from vslam.config import PoseGraphConfig
-from vslam.features import Features
-from vslam.geometry import inverse, inverses, se3_exp, transform
-from vslam.loops import LoopEdge
-from vslam.map import Map
-from vslam.map_kernels import link_many
+from vslam.types.features import Features
+from vslam.types.geometry import inverse, inverses, se3_exp, transform
+from vslam.types.loops import LoopEdge
+from vslam.types.map import Map
+from vslam.types.map_kernels import link_many
 
 CONFIG = PoseGraphConfig()
 

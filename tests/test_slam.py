@@ -14,12 +14,12 @@ from parts import InstantWorkers
 from vslam.backend.local_mapping import local_window
 from vslam.config import Config, KeyframeConfig, MappingConfig, OrbConfig, TrackingConfig
 from vslam.datasets.kitti import open_kitti
-from vslam.features import TrackResult
-from vslam.geometry import inverse, se3_log
 from vslam.loopclosure.detector import NoDetector
-from vslam.map import Map
-from vslam.map_kernels import detach_keyframe
 from vslam.slam import Slam
+from vslam.types.features import TrackResult
+from vslam.types.geometry import inverse, se3_log
+from vslam.types.map import Map
+from vslam.types.map_kernels import detach_keyframe
 
 ORB = OrbConfig(n_features=800)
 CONFIG = Config(orb=ORB)
@@ -546,7 +546,7 @@ def test_a_keyframe_that_cannot_be_mapped_is_the_last_thing_that_happens(
     def fail(*_: object) -> None:
         raise ZeroDivisionError("injected")
 
-    monkeypatch.setattr("vslam.mapping.map_and_calibrate", fail)
+    monkeypatch.setattr("vslam.method.mapping.map_and_calibrate", fail)
     with pytest.raises(ZeroDivisionError, match="injected"):
         drive(range(3, 6))
     monkeypatch.undo()

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vslam.camera import Camera
 from vslam.datasets.frames import (
     Source,
     TimedFrame,
@@ -16,7 +15,8 @@ from vslam.datasets.frames import (
     selected,
     stored_frames,
 )
-from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
+from vslam.support.errors import BrokenSourceError, InputError, UnreadableImageError
+from vslam.types.camera import Camera
 
 N = 9
 CAMERA = Camera(10.0, 10.0, 4.0, 3.0, 0.0, 8, 6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from vslam.datasets.detection import detect_dataset
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,6 @@ from source_files import (
 from test_security import png
 from typer.testing import CliRunner
 
-from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.datasets import open_sequence
 from vslam.datasets.bag_messages import grey_of
@@ -45,13 +44,14 @@ from vslam.datasets.image_folders import open_images
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions
 from vslam.datasets.synthetic.layouts import write_side_by_side
-from vslam.errors import InputError
-from vslam.features import TrackingState
 from vslam.report.folder import create_run_folder
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera
+from vslam.types.features import TrackingState
 
 FRAMES = 12
 STAMPS = [k * 10**8 for k in range(FRAMES)]

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from vslam.config import Config
-from vslam.kernels import kernel
 from vslam.slam import Slam
+from vslam.support.kernels import kernel
 
 REPEATS = 3
 RATIO_MEASURED = 0.56  # frames tracked and mapped on two Xeon cores with AVX-512, November 2026

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from vslam.camera import Camera
 from vslam.config import OrbConfig, StereoConfig
 from vslam.frontend.orb import Extraction, extract
 from vslam.frontend.stereo import inliers_only, match_stereo, rows_to_features, slide
+from vslam.types.camera import Camera
 
 HEIGHT, WIDTH = 200, 480
 ORB = OrbConfig(n_features=600)

@@ -11,13 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.config import Config
 from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.kitti import open_kitti
 from vslam.datasets.perturbation import LAWS, parse_perturbation, sheet_of_laws
-from vslam.errors import InputError
 from vslam.lab.bench.execute import Failed, Finished
 from vslam.lab.bench.grid import Cell, make_grid
 from vslam.lab.stress.criterion import Criterion, absolute_verdict
@@ -33,6 +31,8 @@ from vslam.lab.stress.search import boundary, next_position, strength_at
 from vslam.lab.stress.summary import corruption_entries, mean_error, summarise
 from vslam.report.schema import Machine, ReportJson
 from vslam.run.options import RunOptions
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera
 
 CONFIG = Config().model_dump_json(indent=2) + "\n"
 

@@ -17,7 +17,6 @@ import pytest
 from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
-from vslam.camera import Camera
 from vslam.cli.main import app
 from vslam.datasets import open_sequence
 from vslam.datasets.kitti import open_kitti
@@ -38,9 +37,10 @@ from vslam.datasets.synthetic.shadows import cast_shadows, lamp_pools
 from vslam.datasets.synthetic.site import ALIASES, Variation
 from vslam.datasets.synthetic.solids import turn
 from vslam.datasets.synthetic.town import build_town
-from vslam.errors import InputError
 from vslam.lab.loopbench.drives import render_views
-from vslam.machine import has_avx2
+from vslam.support.errors import InputError
+from vslam.support.machine import has_avx2
+from vslam.types.camera import Camera
 
 CAMERA = Camera(360.0, 360.0, 300.3, 95.7, 0.54, 620, 190)
 BY_DAY = Light(np.array([0.0, -0.8, -0.6]), visibility=1e9, haze=0.0)
@@ -665,7 +665,7 @@ def test_moves_beyond_the_road_are_refused_before_rendering(tmp_path, pairs, opt
 def test_a_route_is_the_same_on_cpus_with_and_without_avx512():
     """On a CPU with AVX-512, OpenBLAS would use kernels that round differently."""
     code = (
-        "from vslam.machine import set_up_openblas; set_up_openblas();"
+        "from vslam.support.machine import set_up_openblas; set_up_openblas();"
         "from vslam.datasets.synthetic.routes import built_in_route;"
         "print(built_in_route('01').T_wc.tobytes().hex())"
     )

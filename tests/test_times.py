@@ -19,7 +19,7 @@ from vslam.datasets.times import (
     times_of_names,
     unit_of_list,
 )
-from vslam.errors import BrokenSourceError, InputError
+from vslam.support.errors import BrokenSourceError, InputError
 
 HERE = Path("here")
 EVEN = [0.1 * k for k in range(40)]

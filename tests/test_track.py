@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 from parts import frame_of
 
-from vslam.camera import Camera
 from vslam.config import Config
-from vslam.context import Context
-from vslam.features import Features
 from vslam.frontend.relocaliser import relocalised
 from vslam.frontend.tracking import refine
-from vslam.geometry import se3_exp, transform
-from vslam.map import Map
-from vslam.map_kernels import link_many
-from vslam.map_view import NO_LANDMARKS, LocalMap, local_map
+from vslam.types.camera import Camera
+from vslam.types.context import Context
+from vslam.types.features import Features
+from vslam.types.geometry import se3_exp, transform
+from vslam.types.map import Map
+from vslam.types.map_kernels import link_many
+from vslam.types.map_view import NO_LANDMARKS, LocalMap, local_map
 
 CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.5, 640, 480)
 CONTEXT = Context.create(CAMERA, Config())

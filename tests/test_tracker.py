@@ -9,17 +9,17 @@ import pytest
 from parts import ALL, CAMERA, NOTHING, OneKeyframe, Points, ahead, frame_of
 
 from vslam.config import Config
-from vslam.context import Context
-from vslam.features import NO_PATCHES, Extracted, Features, TrackingState
-from vslam.frame_poses import FramePoses
 from vslam.frontend.patch_tracking import NO_PATCHES_FOUND, PatchTrack
 from vslam.frontend.track import By, GivenFeatures, Prediction, Track
 from vslam.frontend.tracker import Tracker, judge_patches
 from vslam.frontend.tracking import judge, track_descriptors, track_motion, trusted_landmarks
-from vslam.geometry import se3_exp
-from vslam.map_view import NO_LANDMARKS, MapView
-from vslam.motion import Motion
-from vslam.session import restored_track, tracker_state
+from vslam.method.motion import Motion
+from vslam.method.session import restored_track, tracker_state
+from vslam.types.context import Context
+from vslam.types.features import NO_PATCHES, Extracted, Features, TrackingState
+from vslam.types.frame_poses import FramePoses
+from vslam.types.geometry import se3_exp
+from vslam.types.map_view import NO_LANDMARKS, MapView
 
 CONTEXT = Context.create(CAMERA, Config())
 POINTS = Points.create()

@@ -11,7 +11,6 @@ import pytest
 import torch
 from siamese_worlds import SMALL, small_network, small_settings, views
 
-from vslam.errors import InputError, ResultsError
 from vslam.loopclosure.precision_recall import average_precision, precision_recall
 from vslam.loopclosure.training import training
 from vslam.loopclosure.training.augmentation import STRONG, Augmentation, augment
@@ -32,6 +31,7 @@ from vslam.loopclosure.training.pruning import lowest, pruned
 from vslam.loopclosure.training.settings import PRESETS, load_settings
 from vslam.loopclosure.training.siamese import load_network, save_network
 from vslam.loopclosure.training.training import train
+from vslam.support.errors import InputError, ResultsError
 
 
 @pytest.fixture(autouse=True)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vslam.errors import InputError
-from vslam.geometry import se3_exp
-from vslam.trajectory import (
+from vslam.support.errors import InputError
+from vslam.types.geometry import se3_exp
+from vslam.types.trajectory import (
     Trajectory,
     bridge_gaps,
     quaternions,

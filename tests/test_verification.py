@@ -7,10 +7,10 @@ import pytest
 from test_local_mapping import CAMERA, World, make_world
 
 from vslam.config import ConsistencyConfig, VerificationConfig
-from vslam.geometry import inverse, se3_exp, se3_log
 from vslam.loopclosure.verification import guided_match, reverse_match, verify
-from vslam.loops import LoopCandidate
-from vslam.map_kernels import link_many, refresh_landmarks
+from vslam.types.geometry import inverse, se3_exp, se3_log
+from vslam.types.loops import LoopCandidate
+from vslam.types.map_kernels import link_many, refresh_landmarks
 
 CONFIG = VerificationConfig()
 PASS = 4  # keyframes of each pass

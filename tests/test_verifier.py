@@ -14,8 +14,8 @@ from test_verification import street
 from vslam.config import VerificationConfig
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
 from vslam.loopclosure.verifier import Trial, Verifier
-from vslam.loops import LoopCandidate
-from vslam.states import VerifierState
+from vslam.types.loops import LoopCandidate
+from vslam.types.states import VerifierState
 
 PLAIN = LoopCandidate(1, 0, 0.9, similarity=0.5)
 DOUBT = "proposed for only 1 of the 3 consecutive keyframes needed"

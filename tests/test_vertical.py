@@ -10,18 +10,18 @@ import pytest
 from source_files import run_source
 
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.camera import Camera, same_camera
 from vslam.config import PoseGraphConfig
 from vslam.datasets.fixes import Fixes, to_geodetic
 from vslam.datasets.frames import RawSource, Source, stored_frames
 from vslam.datasets.masks import with_masks
 from vslam.datasets.rectified import rectified
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.features import TrackingState
-from vslam.geometry import adjoint
 from vslam.run.gps import locate
 from vslam.run.outcome import RunOutcome, causal_trajectory, odometry_trajectory
 from vslam.slam import Slam
+from vslam.types.camera import Camera, same_camera
+from vslam.types.features import TrackingState
+from vslam.types.geometry import adjoint
 
 TURNS = [1, -1]
 

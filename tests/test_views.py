@@ -11,7 +11,6 @@ import torch
 from pydantic import ValidationError
 from siamese_worlds import SMALL, masked, small_network, small_settings, views
 
-from vslam.errors import InputError
 from vslam.loopclosure.siamese.images import parse_size, to_size
 from vslam.loopclosure.training.augmentation import STRONG, augment
 from vslam.loopclosure.training.branches import CapsuleShape, Layout
@@ -29,6 +28,7 @@ from vslam.loopclosure.training.siamese import (
     save_network,
 )
 from vslam.loopclosure.training.training import train
+from vslam.support.errors import InputError
 
 WIDE = {"pixels": 48, "width": 81, "views": 2, "view_width": 65}
 SHIFT = 16  # columns between the two views of 81

@@ -12,7 +12,6 @@ import pytest
 
 from vslam.cli import main as cli
 from vslam.config import Config
-from vslam.errors import InputError, ResultsError
 from vslam.loopclosure.registry import create_detector
 from vslam.loopclosure.vocabulary import (
     SHIPPED,
@@ -26,6 +25,7 @@ from vslam.loopclosure.vocabulary import (
 )
 from vslam.loopclosure.vocabulary_text import read_text, write_text
 from vslam.loopclosure.vocabulary_training import train
+from vslam.support.errors import InputError, ResultsError
 
 
 def bits(descriptors: np.ndarray) -> np.ndarray:

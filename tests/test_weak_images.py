@@ -6,9 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vslam.camera import Camera
 from vslam.config import Config, OrbConfig, TrackingConfig, WeakImageConfig
-from vslam.context import Context
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.orb import extract
 from vslam.frontend.stereo import inliers_only, match_stereo
@@ -23,6 +21,8 @@ from vslam.frontend.weak_images import (
     without_noise,
 )
 from vslam.slam import Slam
+from vslam.types.camera import Camera
+from vslam.types.context import Context
 
 ORB = OrbConfig(n_features=800)
 CONFIG = Config(orb=ORB)

@@ -14,7 +14,7 @@ from conftest import StereoSequence
 from typer.testing import CliRunner
 
 from vslam.cli.main import app
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 EXTRA = ("torch", "safetensors", "onnx", "onnxscript")
 # None in sys.modules is not sufficient, because scipy reads attributes of sys.modules["torch"].

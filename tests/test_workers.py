@@ -9,7 +9,7 @@ from concurrent.futures import CancelledError
 
 import pytest
 
-from vslam.workers import Job, Urgency, Workers
+from vslam.support.workers import Job, Urgency, Workers
 
 PATIENCE = 20.0  # seconds; an idle machine needs milliseconds
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def _camera():
-    from vslam.camera import Camera
+    from vslam.types.camera import Camera
 
     return Camera(60.0, 60.0, 31.5, 23.5, 0.2, 64, 48)
 
@@ -60,7 +60,7 @@ def other_images(folder: Path) -> None:
 def kitti(folder: Path) -> None:
     import cv2
 
-    from vslam.trajectory import write_kitti
+    from vslam.types.trajectory import write_kitti
 
     sequence = folder / "sequences" / "00"
     for side, images in zip(("image_0", "image_1"), stereo(), strict=True):
@@ -194,14 +194,14 @@ def video(folder: Path) -> None:
 
 
 def map_file(folder: Path) -> None:
-    from vslam.features import PATCH_PIXELS, Features, FramePatches, KeyframePatches
-    from vslam.frame_poses import FrameTable
-    from vslam.loops import LoopEdge, ResembledPlace
-    from vslam.map import Map
-    from vslam.map_kernels import link_many, merge_landmarks, refresh_landmarks
     from vslam.maps.storage import save_map
     from vslam.maps.stored_map import StoredMap
-    from vslam.states import (
+    from vslam.types.features import PATCH_PIXELS, Features, FramePatches, KeyframePatches
+    from vslam.types.frame_poses import FrameTable
+    from vslam.types.loops import LoopEdge, ResembledPlace
+    from vslam.types.map import Map
+    from vslam.types.map_kernels import link_many, merge_landmarks, refresh_landmarks
+    from vslam.types.states import (
         Checkpoint,
         ClosingState,
         ConsistencyState,
@@ -270,7 +270,7 @@ def _drive(places: range, seed: int) -> Slam:
 
 
 def drive_on(slam: Slam, places: range, seed: int, start: float) -> None:
-    from vslam.features import Extracted, Features
+    from vslam.types.features import Extracted, Features
 
     camera = slam.context.camera  # the camera of the map may differ
     for i, place in enumerate(places):
@@ -289,9 +289,9 @@ def _ring() -> Ring:
 
 def drives(folder: Path) -> None:
     """Write a map with a checkpoint, a loop and a GPS position, and a map that overlaps with it."""
-    from vslam.loops import LoopEdge
     from vslam.maps.storage import save_map
     from vslam.maps.stored_map import TruthAlignment
+    from vslam.types.loops import LoopEdge
 
     stored = _drive(range(24), 0).stored_map("ring 0")
     n = stored.map.n_keyframes
@@ -326,7 +326,7 @@ def vocabulary(folder: Path) -> None:
 
 
 def trajectories(folder: Path) -> None:
-    from vslam.trajectory import Trajectory, write_euroc, write_kitti, write_tum
+    from vslam.types.trajectory import Trajectory, write_euroc, write_kitti, write_tum
 
     T_wc = np.tile(np.eye(4), (5, 1, 1))
     write_kitti(folder / "a.kitti", T_wc)

@@ -277,10 +277,10 @@ def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
     import numpy as np
 
     from vslam.datasets import open_sequence
-    from vslam.errors import InputError
     from vslam.evaluation.trajectories import evaluate_trajectory
     from vslam.lab.stress.external import read_poses
-    from vslam.trajectory import Trajectory
+    from vslam.support.errors import InputError
+    from vslam.types.trajectory import Trajectory
 
     process, frames = run.process, run.report["frames"]
     whole, loop = 1e3 * process.cpu_s / frames, run.report["cpu_ms_per_frame"]

@@ -69,7 +69,7 @@ class Reader:
 
 def _use(source) -> None:
     """Read every frame of a source. Frames that cannot be read are skipped, as in a run."""
-    from vslam.errors import InputError, UnreadableImageError
+    from vslam.support.errors import InputError, UnreadableImageError
 
     try:
         for frame in source.frames():
@@ -83,7 +83,7 @@ def _use(source) -> None:
 
 def _each(read: Callable[[str], object], names: Iterable[str]) -> None:
     """Read all files. If some files were rejected, raise one of the errors at the end."""
-    from vslam.errors import InputError
+    from vslam.support.errors import InputError
 
     refused = None
     for name in names:
@@ -124,8 +124,8 @@ def _read_calibrations(folder: Path) -> None:
 
 
 def _read_map(folder: Path) -> None:
-    from vslam.map_kernels import resolve
     from vslam.maps.storage import load_checkpoint
+    from vslam.types.map_kernels import resolve
 
     stored = load_checkpoint(folder / "map.npz")
     for map_ in (stored.map, stored.compact().map):
@@ -150,15 +150,15 @@ def _use_map_in(file: Path, other: Path, out: Path) -> None:
     from vslam.cli.export import g2o
     from vslam.cli.map import info
     from vslam.config import Config
-    from vslam.errors import InputError
     from vslam.loopclosure.registry import detector_with_images
     from vslam.maps.colmap import save_colmap
     from vslam.maps.formats import save_ply
     from vslam.maps.reconstruction import reconstruction_of
     from vslam.maps.storage import load_map
     from vslam.maps.stored_map import in_box
-    from vslam.merging import merge_maps
+    from vslam.method.merging import merge_maps
     from vslam.slam import Slam
+    from vslam.support.errors import InputError
 
     stored = load_map(file)
     map_ = stored.map
@@ -213,7 +213,7 @@ def _read_vocabulary(folder: Path) -> None:
 
 
 def _read_trajectories(folder: Path) -> None:
-    from vslam.trajectory import read_trajectory
+    from vslam.types.trajectory import read_trajectory
 
     _each(lambda name: read_trajectory(folder / name), ("a.kitti", "a.tum", "a.csv"))
 
@@ -477,7 +477,7 @@ def _work(name: str, first: int, inputs: int, seed: int, scratch: Path) -> None:
     For each input, a JSON line with its number is printed before it is read, and a JSON line with
     the outcome afterwards.
     """
-    from vslam.errors import InputError
+    from vslam.support.errors import InputError
 
     logging.disable(logging.CRITICAL)
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))

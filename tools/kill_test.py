@@ -23,11 +23,11 @@ import tempfile
 import time
 from pathlib import Path
 
-from vslam.errors import InputError
 from vslam.maps.storage import load_map
 from vslam.run.autosave import MAP, ONLINE, PROGRESS
 from vslam.run.progress import read_progress
-from vslam.trajectory import read_trajectory
+from vslam.support.errors import InputError
+from vslam.types.trajectory import read_trajectory
 
 RUN = (sys.executable, "-m", "vslam", "run")
 BRIEF = ("--no-record", "--no-report", "--quiet")

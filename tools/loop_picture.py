@@ -17,9 +17,9 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from vslam.geometry import inverses
 from vslam.maps.storage import load_map
 from vslam.maps.stored_map import StoredMap
+from vslam.types.geometry import inverses
 
 INCHES, DOTS_PER_INCH = (6.44, 2.7), 200  # size of the map, which is as wide as the loop's picture
 MARGIN = 20.0  # metres around the path

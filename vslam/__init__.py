@@ -10,25 +10,25 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from vslam.method import METHOD_VERSION
-from vslam.untrusted import limit_images
+from vslam.method.version import METHOD_VERSION
+from vslam.support.untrusted import limit_images
 
 __version__ = "0.1.0"
 __all__ = ["METHOD_VERSION", "Camera", "Slam", "TrackResult", "TrackingState", "__version__"]
 
 _MODULES = {
     "Slam": "vslam.slam",
-    "Camera": "vslam.camera",
-    "TrackResult": "vslam.features",
-    "TrackingState": "vslam.features",
+    "Camera": "vslam.types.camera",
+    "TrackResult": "vslam.types.features",
+    "TrackingState": "vslam.types.features",
 }
 
 limit_images()
 
 if TYPE_CHECKING:
-    from vslam.camera import Camera
-    from vslam.features import TrackingState, TrackResult
     from vslam.slam import Slam
+    from vslam.types.camera import Camera
+    from vslam.types.features import TrackingState, TrackResult
 
 
 def __getattr__(name: str) -> Any:

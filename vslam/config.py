@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from vslam.errors import InputError, did_you_mean, plain_reason
+from vslam.support.errors import InputError, did_you_mean, plain_reason
 
 _Model = TypeVar("_Model", bound=BaseModel)
 # Older maps and configurations have other names for some thresholds of the section ``learned``.

@@ -10,25 +10,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, DepthImage, Image
 from vslam.config import Config, as_config
-from vslam.context import Context
-from vslam.errors import InputError
-from vslam.features import Extracted, TrackResult
 from vslam.frontend.extraction import FrameImages, checked_images
 from vslam.frontend.track import GivenFeatures, Track
-from vslam.gaps import Gap, find_gaps
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.loops import LoopCorrection, LoopEdge
-from vslam.map import Map
-from vslam.map_frames import in_first_part, keyframe_trajectory
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
-from vslam.session import Session
-from vslam.trajectory import Trajectory
-from vslam.workers import Workers
+from vslam.method.gaps import Gap, find_gaps
+from vslam.method.map_frames import in_first_part, keyframe_trajectory
+from vslam.method.session import Session
+from vslam.support.errors import InputError
+from vslam.support.workers import Workers
+from vslam.types.camera import Camera, DepthImage, Image
+from vslam.types.context import Context
+from vslam.types.features import Extracted, TrackResult
+from vslam.types.loops import LoopCorrection, LoopEdge
+from vslam.types.map import Map
+from vslam.types.trajectory import Trajectory
 
 
 def _ignore(result: TrackResult) -> None:

@@ -18,8 +18,8 @@ from tf2_msgs.msg import TFMessage
 from vslam import Slam
 from vslam.datasets.bag_messages import grey_of, levels_of_messages, stamp_of
 from vslam.datasets.grey_levels import Levels
-from vslam.features import TrackResult
 from vslam.maps.ros import FramePose, odometry_message, static_tf_message, tf_message
+from vslam.types.features import TrackResult
 
 TOPICS = {
     "left/image_rect": Image,

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import LearnedMatchingConfig, SiameseConfig
-from vslam.features import Features
 from vslam.loopclosure.bow_index import grown
 from vslam.loopclosure.detector import require_same
 from vslam.loopclosure.local_matching import DescriptorMaps, likeness
@@ -17,8 +16,9 @@ from vslam.loopclosure.reach import beyond_reach
 from vslam.loopclosure.siamese.images import to_size
 from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.loops import DetectorMemory, LoopCandidate, PerKeyframe
-from vslam.map import Map
+from vslam.types.features import Features
+from vslam.types.loops import DetectorMemory, LoopCandidate, PerKeyframe
+from vslam.types.map import Map
 
 
 class SiameseDetector:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vslam.errors import InputError
 from vslam.loopclosure.siamese.image_source import (
     DIFFERENT,
     SAME,
@@ -16,7 +15,8 @@ from vslam.loopclosure.siamese.image_source import (
     names_of,
     read_loop_matrix,
 )
-from vslam.trajectory import read_table
+from vslam.support.errors import InputError
+from vslam.types.trajectory import read_table
 
 _UNDISTORT_COLUMNS = (8, 9)
 

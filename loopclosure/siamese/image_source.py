@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
 from vslam.loopclosure.siamese.images import Fit, Size, read_grey, to_size
-from vslam.untrusted import is_image
+from vslam.support.errors import InputError
+from vslam.support.untrusted import is_image
 
 SAME, UNKNOWN, DIFFERENT = 1, 0, -1
 _NO_TRUTH = (

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, UnreadableImageError
+from vslam.support.errors import InputError, UnreadableImageError
 
 _FIELD_OF_VIEW = 80.0  # horizontal field of view that turn_homography assumes, degrees
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
 from vslam.loopclosure.siamese.images import Size
 from vslam.loopclosure.siamese.weights import SHIPPED, find_weights
+from vslam.support.errors import InputError
 
 # Keys of the metadata of an ONNX file.
 FORMAT, NAME, ABOUT, COMPARISON = "vslam", "name", "about", "comparison"

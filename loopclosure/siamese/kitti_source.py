@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
 from vslam.loopclosure.siamese.image_source import (
     DIFFERENT,
     SAME,
@@ -22,7 +21,8 @@ from vslam.loopclosure.siamese.image_source import (
     names_of,
     read_loop_matrix,
 )
-from vslam.trajectory import read_kitti_poses, read_table
+from vslam.support.errors import InputError
+from vslam.types.trajectory import read_kitti_poses, read_table
 
 _FAR = 25.0  # distance beyond which two images show different places, metres
 

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
 from vslam.loopclosure.local_matching import DescriptorMaps
 from vslam.loopclosure.siamese.inference import FORMAT, NAME, VERSION, open_session
 from vslam.loopclosure.siamese.weights import SHIPPED
-from vslam.loops import PerKeyframe
+from vslam.support.errors import InputError
+from vslam.types.loops import PerKeyframe
 
 SHIPPED_LOCAL = SHIPPED / "local.onnx"
 WIDTH = 640  # width of the network's input, pixels

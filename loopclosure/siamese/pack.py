@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, write_file
 from vslam.loopclosure.siamese.image_source import ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
-from vslam.untrusted import read_npz
+from vslam.support.errors import InputError, write_file
+from vslam.support.untrusted import read_npz
 
 
 def write_pack(sources: list[ImageSource], path: Path, size: Size, fit: Fit) -> None:

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, ImageSource, names_of
+from vslam.support.errors import InputError
 
 _VIEW = ("x_a", "z_a", "yaw_a", "x_b", "z_b", "yaw_b")
 # Side of the square cells that a rendered town is divided into, metres. The images of one cell are

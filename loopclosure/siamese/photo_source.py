@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vslam.errors import InputError
 from vslam.loopclosure.siamese.image_source import (
     DIFFERENT,
     SAME,
@@ -19,6 +18,7 @@ from vslam.loopclosure.siamese.image_source import (
     images_in,
     names_of,
 )
+from vslam.support.errors import InputError
 
 _STRETCH = 25  # consecutive video frames that are not split between training and validation
 _UNLIMITED = 1_000_000

@@ -35,13 +35,13 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from vslam.errors import InputError, did_you_mean
 from vslam.loopclosure.siamese.fabmap_source import read_fabmap
 from vslam.loopclosure.siamese.image_source import ImageSource
 from vslam.loopclosure.siamese.kitti_source import read_kitti
 from vslam.loopclosure.siamese.pack import read_pack
 from vslam.loopclosure.siamese.pairs_source import read_pairs
 from vslam.loopclosure.siamese.photo_source import read_photos
+from vslam.support.errors import InputError, did_you_mean
 
 # The reader of each kind and the names of its options.
 _READERS: dict[str, tuple[Callable[..., list[ImageSource]], tuple[str, ...]]] = {

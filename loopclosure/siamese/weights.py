@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 NETWORKS = ("capsule", "capsule-pruned", "capsule-paper")
 PRUNED = ("capsule-pruned", "capsule-paper")

@@ -15,7 +15,6 @@ from pydantic import (
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vslam.errors import InputError, plain_reason
 from vslam.loopclosure.siamese.images import Size
 from vslam.loopclosure.training.capsules import CapsuleLayer
 from vslam.loopclosure.training.extractors import (
@@ -30,6 +29,7 @@ from vslam.loopclosure.training.lite import (
     lite_grid_side,
 )
 from vslam.loopclosure.training.preprocessing import Unrolling, standardised, textured
+from vslam.support.errors import InputError, plain_reason
 
 _LEAST_SHARE = 0.02  # least weight of a view, so that an image without texture has a descriptor
 

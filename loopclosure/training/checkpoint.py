@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 from pydantic import ValidationError
 
-from vslam.errors import InputError, write_file
 from vslam.loopclosure.training.data import Pairs
 from vslam.loopclosure.training.settings import TrainSettings
 from vslam.loopclosure.training.siamese import SiameseNetwork
+from vslam.support.errors import InputError, write_file
 
 CHECKPOINT = "checkpoint.pt"
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, write_file
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.images import Fit, Size
+from vslam.support.errors import InputError, write_file
 
 # First and last frame of each sequence that training may use. All other frames are test data.
 TRAINING_FRAMES = {"kitti00": (250, 1499)}

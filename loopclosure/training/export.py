@@ -16,7 +16,6 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
-from vslam.errors import ResultsError, write_file
 from vslam.loopclosure.siamese.inference import (
     ABOUT,
     COMPARISON,
@@ -26,6 +25,7 @@ from vslam.loopclosure.siamese.inference import (
     OnnxNetwork,
 )
 from vslam.loopclosure.training.siamese import SiameseNetwork, for_inference
+from vslam.support.errors import ResultsError, write_file
 
 TOLERANCE = 1e-4  # largest accepted difference from torch in a descriptor of norm 1
 SIMILARITY_TOLERANCE = 0.02  # large: the square root magnifies rounding at small distances

@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from torch.nn import functional
 
-from vslam.errors import InputError
 from vslam.loopclosure.siamese.weights import PRUNED
 from vslam.loopclosure.training.branches import Layout
 from vslam.loopclosure.training.data import Collection, divide, validation_images
@@ -34,6 +33,7 @@ from vslam.loopclosure.training.siamese import (
     for_inference,
     load_network,
 )
+from vslam.support.errors import InputError
 
 _RANKING_IMAGES = 1000  # approximate number of images that rank the capsules for pruning
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 # Expansion, channels, stride and kernel size of the blocks of the first five stages.
 _BLOCKS = (

@@ -12,11 +12,11 @@ from typing import Any
 
 import torch
 
-from vslam.errors import write_file
 from vslam.loopclosure.training.data import Collection
 from vslam.loopclosure.training.settings import TrainSettings
 from vslam.loopclosure.training.siamese import SiameseNetwork
 from vslam.loopclosure.training.training import TrainingOutcome
+from vslam.support.errors import write_file
 
 
 def describe(

@@ -13,9 +13,9 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from vslam.errors import InputError
 from vslam.loopclosure.training.branches import CapsuleBranch
 from vslam.loopclosure.training.siamese import SiameseNetwork
+from vslam.support.errors import InputError
 
 
 @torch.no_grad()

@@ -13,11 +13,11 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vslam.errors import InputError, write_file
 from vslam.loopclosure.siamese.weights import NETWORKS
 from vslam.loopclosure.training.branches import CapsuleBranch, CapsuleShape
 from vslam.loopclosure.training.capsules import TINY
 from vslam.loopclosure.training.extractors import fold_batch_norms
+from vslam.support.errors import InputError, write_file
 
 _SOFTNESS = 0.04  # temperature of the soft maximum over alignments, in units of cosine similarity
 

@@ -23,7 +23,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, ResultsError, write_file
 from vslam.loopclosure.training.augmentation import augment
 from vslam.loopclosure.training.checkpoint import (
     CHECKPOINT,
@@ -58,6 +57,7 @@ from vslam.loopclosure.training.siamese import (
     load_network,
     save_network,
 )
+from vslam.support.errors import InputError, ResultsError, write_file
 
 OnStep = Callable[[int, int, int, float], None]
 """Arguments: epoch, step, number of steps in the epoch, loss."""

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from vslam.calibration.documents import read_document
 from vslam.calibration.models import Array
-from vslam.camera import Image
-from vslam.errors import InputError
+from vslam.support.errors import InputError
+from vslam.types.camera import Image
 
 Kind = Literal["checkerboard", "charuco", "aprilgrid"]
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from vslam.calibration.models import Array
-from vslam.errors import InputError
-from vslam.file_kinds import identify, read_text
+from vslam.support.errors import InputError
+from vslam.support.file_kinds import identify, read_text
 
 _HEADER = re.compile(r"\A\ufeff?%YAML[: ]1\.\d.*\n?")
 # A file of this size takes two seconds to parse. A calibration file has about 5,000 bytes.

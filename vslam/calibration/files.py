@@ -19,7 +19,7 @@ from vslam.calibration.formats import (
     read_ros,
 )
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.errors import InputError, write_file
+from vslam.support.errors import InputError, write_file
 
 NEEDED_CALIBRATION = (
     "give a file with the cameras' focal lengths, centres, distortion and, for two cameras, "

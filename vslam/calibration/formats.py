@@ -25,9 +25,9 @@ from vslam.calibration.models import (
     Lens,
     without_zeros,
 )
-from vslam.camera import principal_point_doubt
-from vslam.errors import InputError
-from vslam.untrusted import MOST_PIXELS
+from vslam.support.errors import InputError
+from vslam.support.untrusted import MOST_PIXELS
+from vslam.types.camera import principal_point_doubt
 
 Size = tuple[int, int]
 _LENSES: dict[str, Lens] = {

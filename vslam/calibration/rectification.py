@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration.models import Array, Calibration, CameraModel, project, unproject
-from vslam.camera import Camera, Image
-from vslam.errors import InputError
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera, Image
 
 Pixels = TypeVar("Pixels", bound=NDArray[np.generic])
 

@@ -18,8 +18,8 @@ from scipy.optimize import least_squares
 
 from vslam.calibration.boards import Board, View, board_points
 from vslam.calibration.models import Array, Calibration, CameraModel, Lens, project
-from vslam.errors import InputError, counted
-from vslam.geometry import inverse, orthonormalised, se3_exp, transform
+from vslam.support.errors import InputError, counted
+from vslam.types.geometry import inverse, orthonormalised, se3_exp, transform
 
 Size = tuple[int, int]
 Frame = tuple[View | None, ...]  # the view of each camera; None for a camera that sees no board

@@ -30,7 +30,7 @@ from vslam.cli.options import (
     sequences,
 )
 from vslam.cli.report import write_overview_of
-from vslam.errors import counted
+from vslam.support.errors import counted
 
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions

@@ -12,14 +12,14 @@ import typer
 
 from vslam.cli.console import Console
 from vslam.cli.options import METHOD, OUTPUT, option, reads_source
-from vslam.errors import BrokenSourceError, InputError, ResultsError
+from vslam.support.errors import BrokenSourceError, InputError, ResultsError
 
 if TYPE_CHECKING:
     from vslam.calibration.boards import Board
     from vslam.calibration.solve import Frame
-    from vslam.camera import Image
     from vslam.datasets.frames import RawSource, TimedFrame
     from vslam.datasets.sources import SourceOptions
+    from vslam.types.camera import Image
 
 _EXAMPLES = """
 [b]Examples[/b]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from vslam.cli.console import Console
 from vslam.cli.options import kind_of_source, names_in, open_given, read_thresholds
-from vslam.errors import InputError, did_you_mean
+from vslam.support.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from vslam.datasets.frames import Source
@@ -164,8 +164,8 @@ class Cells:
 
             return run_on_cluster(cells, self.options, self.scheduler, self.out)
         from vslam.lab.bench.execute import run_here
-        from vslam.machine import available_cores
         from vslam.run.warmup import compile_kernels, is_cold
+        from vslam.support.machine import available_cores
 
         if cells and is_cold():  # compiled once here, not in each run
             self.console.announce("first run: compiling the kernels, about a minute ...")
@@ -192,7 +192,7 @@ def open_cells(
             sequence.
     """
     from vslam.lab.bench.execute import RunOptions, scratch_folder
-    from vslam.machine import available_cores
+    from vslam.support.machine import available_cores
 
     out, console = out.absolute(), Console(shown=shown)
     kind = kind_of_source(given)

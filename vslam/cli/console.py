@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vslam.features import TrackResult
+    from vslam.types.features import TrackResult
 
 
 class Console:

@@ -18,7 +18,7 @@ from vslam.cli.options import (
     reads_source,
     require_data,
 )
-from vslam.errors import InputError, counted
+from vslam.support.errors import InputError, counted
 
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions

@@ -12,7 +12,7 @@ import typer
 
 from vslam.cli.console import Console
 from vslam.cli.options import open_given
-from vslam.errors import InputError, ResultsError
+from vslam.support.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
     from vslam.datasets.fixes import Fixes
@@ -139,8 +139,8 @@ def _fixes(path: Path, antenna: tuple[float, ...] | None, source: Source) -> Fix
 def _georeferenced(outcome: RunOutcome, fixes: Fixes) -> tuple[RunOutcome, str]:
     """Return the outcome of a run with the georeferenced trajectory, and an error message, which is
     empty on success."""
-    from vslam.plugins import reason
     from vslam.run.gps import locate
+    from vslam.support.plugins import reason
 
     if outcome.stored is None:
         return outcome, "the run has no map."

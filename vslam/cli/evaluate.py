@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from vslam.cli.options import AlignmentName
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -115,7 +115,7 @@ def evaluate_files(
 def _files_of_run(folder: Path, gt: Path | None, times: Path | None) -> tuple[Path, Path, str]:
     """Return the files of the trajectory and of the ground truth of a run, and its sensor."""
     from vslam.report.schema import ReportJson
-    from vslam.trajectory import trajectory_format
+    from vslam.types.trajectory import trajectory_format
 
     report = ReportJson.read(folder / "report.json")
     written = (folder / name for name in ("ground_truth_kitti.txt", "ground_truth.tum"))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.options import INPUT, OUTPUT, Quiet, flag, option
-from vslam.errors import InputError, counted
+from vslam.support.errors import InputError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
     from vslam.backend.pose_graph import PoseGraph
     from vslam.datasets.frames import TimedFrame
-    from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
     from vslam.maps.stored_map import StoredMap
     from vslam.report.finished_run import FinishedRun
+    from vslam.types.map import Map
 
     Colours = NDArray[np.uint8]
 
@@ -149,9 +149,9 @@ def g2o(
     import numpy as np
 
     from vslam.backend.pose_graph import LOOP
-    from vslam.geometry import inverses
     from vslam.maps.formats import save_g2o
     from vslam.maps.new_output import new_output
+    from vslam.types.geometry import inverses
 
     graph, map_ = _graph(run)
     ids = graph.keyframes  # frame numbers repeat in a map of several drives
@@ -176,7 +176,7 @@ def euroc(
     Every run writes its trajectory in the formats of TUM and KITTI, too.
     """
     from vslam.maps.new_output import new_output
-    from vslam.trajectory import read_trajectory, write_euroc
+    from vslam.types.trajectory import read_trajectory, write_euroc
 
     trajectory = read_trajectory(run / "trajectory.tum")
     target = out or run / "trajectory_euroc.csv"
@@ -208,7 +208,7 @@ def ros(
     from vslam.maps.ros import frame_poses, save_bag
     from vslam.maps.storage import load_map
     from vslam.report.frame_table import read_covariances
-    from vslam.trajectory import read_trajectory
+    from vslam.types.trajectory import read_trajectory
 
     target = out or run / "ros.mcap"
     if target.suffix != ".mcap":

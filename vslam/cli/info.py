@@ -10,7 +10,7 @@ import typer
 
 from vslam.cli.options import kitti_root
 from vslam.cli.tables import print_rows
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 app = typer.Typer()
 
@@ -28,8 +28,8 @@ def info(
 ) -> None:
     """Show versions, cores, compiled kernels, installed plug-ins, and the KITTI sequences on this
     machine."""
-    from vslam import machine, plugins
     from vslam.datasets.kitti import list_kitti
+    from vslam.support import machine, plugins
 
     root = Path(kitti_root()) if data is None else data
     versions = machine.versions()

@@ -21,7 +21,7 @@ from vslam.cli.options import (
     option,
     require_writable,
 )
-from vslam.errors import InputError, counted
+from vslam.support.errors import InputError, counted
 
 if TYPE_CHECKING:
     from vslam.lab.loopbench.schema import Gain, OnlineScore, Score
@@ -122,7 +122,7 @@ def bench(
     from vslam.lab.loopbench.sets import open_set
     from vslam.loopclosure.vocabulary import SHIPPED
     from vslam.loopclosure.vocabulary_text import read_vocabulary
-    from vslam.machine import available_cores
+    from vslam.support.machine import available_cores
 
     vocabulary = read_vocabulary(files.get("bow", SHIPPED))
     scorers = [open_scorer(name, files.get(name), vocabulary) for name in names]
@@ -166,8 +166,8 @@ def bench(
 def _write(out: Path, seed: int, **found: object) -> None:
     from vslam.lab.loopbench.report import write_report
     from vslam.lab.loopbench.schema import LoopsJson
-    from vslam.machine import versions
     from vslam.report.summary import this_machine
+    from vslam.support.machine import versions
 
     here = this_machine()
     report = {

@@ -33,10 +33,10 @@ from vslam.cli import (
     vocabulary,
 )
 from vslam.cli import map as map_
-from vslam.errors import InputError, ResultsError, did_you_mean, plain_reason
-from vslam.machine import keep_memory, set_up_openblas
-from vslam.plugins import reason
-from vslam.untrusted import require_utf8
+from vslam.support.errors import InputError, ResultsError, did_you_mean, plain_reason
+from vslam.support.machine import keep_memory, set_up_openblas
+from vslam.support.plugins import reason
+from vslam.support.untrusted import require_utf8
 
 _GROUPS: tuple[ModuleType, ...] = (
     run, evaluate, perturb, info, calibrate, doctor, bench, stress, report, synth, train, export,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.options import METHOD, OUTPUT, Quiet, Thresholds, option, read_thresholds
-from vslam.errors import InputError, counted
+from vslam.support.errors import InputError, counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
     from vslam.cli.tables import Rows
     from vslam.config import Config
-    from vslam.map import Map
     from vslam.maps.reconstruction import Reconstruction
     from vslam.maps.stored_map import StoredMap
+    from vslam.types.map import Map
 
 app = typer.Typer(
     name="map",
@@ -62,7 +62,7 @@ def info(
 
 
 def _submaps(stored: StoredMap) -> str:
-    from vslam.hypotheses import joined_submaps
+    from vslam.method.hypotheses import joined_submaps
 
     if not stored.map.n_keyframes:
         return "0"
@@ -141,7 +141,7 @@ def merge(
     from vslam.cli.console import Console
     from vslam.loopclosure.registry import detector_with_images
     from vslam.maps.storage import load_map, map_file_of
-    from vslam.merging import Memory, merge_maps
+    from vslam.method.merging import Memory, merge_maps
 
     if len(maps) < 2:
         raise InputError(f"{maps[0]}: a single map cannot be merged; give two or more.")

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
-from vslam import plugins
-from vslam.errors import InputError
+from vslam.support import plugins
+from vslam.support.errors import InputError
 
 if TYPE_CHECKING:
     from vslam.cli.console import Console

@@ -9,7 +9,7 @@ import typer
 
 from vslam.cli.console import Console
 from vslam.cli.options import OUTPUT, Perturb, Seed, flag, open_given, option, reads_source
-from vslam.errors import write_file
+from vslam.support.errors import write_file
 
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions

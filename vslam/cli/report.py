@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from vslam.cli.options import OUTPUT, Quiet, flag, option
-from vslam.errors import counted
+from vslam.support.errors import counted
 
 _EXAMPLES = """
 [b]Examples[/b]

@@ -29,7 +29,7 @@ from vslam.cli.options import (
     read_thresholds,
     reads_source,
 )
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 if TYPE_CHECKING:
     from vslam.datasets.sources import SourceOptions
@@ -215,8 +215,8 @@ def run(
         )
 
     from vslam.config import as_config
-    from vslam.machine import available_cores
     from vslam.run.options import RunOptions
+    from vslam.support.machine import available_cores
 
     options = RunOptions(
         **given.model_dump(),

@@ -27,7 +27,7 @@ from vslam.cli.options import (
     reads_source,
     sequences,
 )
-from vslam.errors import InputError, did_you_mean
+from vslam.support.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from vslam.datasets.frames import Source

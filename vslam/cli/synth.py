@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from vslam.cli.options import OUTPUT, Quiet, Threads, flag, option
-from vslam.errors import InputError, counted
+from vslam.support.errors import InputError, counted
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -143,8 +143,8 @@ def synth(
         route_of_poses,
         store,
     )
-    from vslam.machine import available_cores
-    from vslam.trajectory import read_kitti_poses
+    from vslam.support.machine import available_cores
+    from vslam.types.trajectory import read_kitti_poses
 
     cache = out or store.cache_folder()
     town = Variation()

@@ -25,7 +25,7 @@ from vslam.cli.options import (
     option,
     require_writable,
 )
-from vslam.errors import InputError, counted, write_file
+from vslam.support.errors import InputError, counted, write_file
 
 _TRAIN_EXAMPLES = """
 [b]Examples[/b]
@@ -149,7 +149,7 @@ def train(
     from vslam.loopclosure.training.siamese import load_network
     from vslam.loopclosure.training.training import set_threads
     from vslam.loopclosure.training.training import train as run
-    from vslam.machine import available_cores
+    from vslam.support.machine import available_cores
 
     until = None if max_minutes is None else time.monotonic() + 60.0 * max_minutes
     folder = out or Path("training") / f"{network}-{preset}"

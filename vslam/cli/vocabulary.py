@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.options import OUTPUT, Quiet, Seed, option
-from vslam.errors import InputError, UnreadableImageError, counted
+from vslam.support.errors import InputError, UnreadableImageError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -139,7 +139,7 @@ def info(
 def _find_images(images: list[str]) -> list[Path]:
     import glob
 
-    from vslam.untrusted import is_image
+    from vslam.support.untrusted import is_image
 
     found: dict[Path, None] = {}
     for name in images:
@@ -163,7 +163,7 @@ def _extract_all(paths: list[Path], config: OrbConfig) -> Iterator[NDArray[np.ui
 
     from vslam.datasets.image_files import read_grey
     from vslam.frontend.orb import extract
-    from vslam.machine import available_cores
+    from vslam.support.machine import available_cores
 
     def one(path: Path) -> NDArray[np.uint8] | None:
         try:

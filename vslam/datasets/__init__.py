@@ -10,9 +10,9 @@ from collections.abc import Sequence as Several
 from pathlib import Path
 from typing import Any
 
-from vslam import plugins
 from vslam.datasets.frames import Source
-from vslam.errors import InputError, did_you_mean
+from vslam.support import plugins
+from vslam.support.errors import InputError, did_you_mean
 
 _DEFAULT_NAME = "00"  # of KITTI and of the rendered towns
 DATASETS = ("kitti", "kitti_raw", "euroc", "tum", "synthetic")  # plug-ins may add others

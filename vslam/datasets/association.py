@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.times import UNITS
-from vslam.errors import InputError
-from vslam.trajectory import Trajectory, could_be_seconds, read_trajectory, trajectory_format
+from vslam.support.errors import InputError
+from vslam.types.trajectory import Trajectory, could_be_seconds, read_trajectory, trajectory_format
 
 DEPTH_NEAR_S = 0.02
 """Upper limit of the seconds between an image and its depth, as in TUM's associate.py."""

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from vslam.calibration.files import NEEDED_CALIBRATION
 from vslam.calibration.formats import read_ros
 from vslam.calibration.models import Calibration
-from vslam.camera import DepthImage, Image, ImageMap
 from vslam.datasets.association import DEPTH_NEAR_S, Pairing
 from vslam.datasets.bag_files import Recording, first_message, messages, opened
 from vslam.datasets.bag_messages import (
@@ -51,7 +50,8 @@ from vslam.datasets.bag_topics import (
 from vslam.datasets.frames import Images, RawSource, Size, TimedFrame, decoded
 from vslam.datasets.grey_levels import Levels
 from vslam.datasets.image_files import size_text
-from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
+from vslam.support.errors import BrokenSourceError, InputError, UnreadableImageError
+from vslam.types.camera import DepthImage, Image, ImageMap
 
 _TOLERANCE_NS = 5_000_000
 # A Kinect takes images and depth alternately.

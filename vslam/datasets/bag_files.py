@@ -19,7 +19,7 @@ from types import SimpleNamespace
 from typing import Any, BinaryIO
 
 from vslam.datasets.bag_messages import READ_TYPES, Message, from_foxglove
-from vslam.errors import BrokenSourceError, InputError
+from vslam.support.errors import BrokenSourceError, InputError
 
 _MOST_METADATA = 1_000_000  # bytes; a hundred topics need 100,000
 _MAGIC = {".bag": b"#ROSBAG V", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}

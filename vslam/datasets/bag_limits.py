@@ -18,8 +18,8 @@ from typing import Any, Protocol
 MOST_BYTES = 2**29
 """Largest size of a decompressed chunk or message in bytes.
 
-It is enough for an image of `vslam.untrusted.MOST_PIXELS` with four bytes per pixel. Recorders
-write chunks of 0.8 to 4 MB.
+It is enough for an image of `vslam.support.untrusted.MOST_PIXELS` with four bytes per pixel.
+Recorders write chunks of 0.8 to 4 MB.
 """
 
 _FREE_BYTES = 2**30  # disk space that must remain free after a whole bag is decompressed

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration.documents import Document
-from vslam.camera import DepthImage, Image
 from vslam.datasets.grey_levels import Levels, decode, levels_of, upper_bits
+from vslam.types.camera import DepthImage, Image
 
 Message = Any  # classes that rosbags generates from the bag's message definitions
 

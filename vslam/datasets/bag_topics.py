@@ -25,7 +25,7 @@ from vslam.datasets.bag_messages import (
     Message,
     depth_in,
 )
-from vslam.errors import BrokenSourceError, InputError
+from vslam.support.errors import BrokenSourceError, InputError
 
 _NEEDED = {
     "mono": "an image topic",

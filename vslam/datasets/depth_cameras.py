@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration.models import Calibration
-from vslam.camera import DepthImage, Image, ImageMap
 from vslam.datasets.frames import Images, RawSource, TimedFrame
-from vslam.errors import BrokenSourceError, InputError
+from vslam.support.errors import BrokenSourceError, InputError
+from vslam.types.camera import DepthImage, Image, ImageMap
 
 FPS = 30
 TIMEOUT_S = 10

@@ -11,9 +11,9 @@ from vslam.datasets.euroc import is_euroc
 from vslam.datasets.image_folders import has_images
 from vslam.datasets.kitti_raw import is_kitti_raw
 from vslam.datasets.tum import is_tum
-from vslam.errors import InputError
-from vslam.file_kinds import identify, what_is_in
-from vslam.untrusted import is_image
+from vslam.support.errors import InputError
+from vslam.support.file_kinds import identify, what_is_in
+from vslam.support.untrusted import is_image
 
 _BAG_SUFFIXES = {".bag", ".mcap", ".db3"}
 _TEXTS = {".txt", ".csv", ".yaml", ".yml", ".json", ".md", ".py", ".html"}

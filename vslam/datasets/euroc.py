@@ -37,8 +37,8 @@ from vslam.datasets.times import (
     ordered_list,
     unit_of_list,
 )
-from vslam.errors import InputError
-from vslam.file_kinds import what_is_in
+from vslam.support.errors import InputError
+from vslam.support.file_kinds import what_is_in
 
 _HOME = "https://projects.asl.ethz.ch/datasets/euroc-mav/"
 _MOST_APART_NS = 5_000_000  # between the images of a pair, which are triggered together

@@ -21,9 +21,9 @@ from vslam.datasets.bag import read_fixes_of_bag
 from vslam.datasets.detection import is_bag
 from vslam.datasets.frames import Source
 from vslam.datasets.times import read_times
-from vslam.errors import InputError
-from vslam.file_kinds import read_text
-from vslam.trajectory import read_table
+from vslam.support.errors import InputError
+from vslam.support.file_kinds import read_text
+from vslam.types.trajectory import read_table
 
 # Standard deviation for receivers that do not state one. It is typical under an open sky.
 DEFAULT_SIGMA_M = 2.0

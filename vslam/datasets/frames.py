@@ -20,10 +20,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, DepthImage, Image, ImageMap
 from vslam.datasets.association import Pairing
 from vslam.datasets.times import Timing, in_order
-from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
+from vslam.support.errors import BrokenSourceError, InputError, UnreadableImageError
+from vslam.types.camera import Camera, DepthImage, Image, ImageMap
 
 Images = tuple[Image, Image | DepthImage | None]
 Size = tuple[int, int]
@@ -41,10 +41,10 @@ class TimedFrame:
     Attributes:
         timestamp: seconds.
         read: function that decodes the left and the second image. Its argument is a map function
-            (`vslam.camera.ImageMap`), which may decode both images in parallel. The left image is
-            ``(H, W)`` uint8. For stereo, the second image is the right image, ``(H, W)`` uint8. For
-            RGB-D, it is the depth of the left image's pixels, ``(H, W)`` float32 metres, 0 where
-            the depth is unknown. For a monocular source, it is None.
+            (`vslam.types.camera.ImageMap`), which may decode both images in parallel. The left
+            image is ``(H, W)`` uint8. For stereo, the second image is the right image, ``(H, W)``
+            uint8. For RGB-D, it is the depth of the left image's pixels, ``(H, W)`` float32
+            metres, 0 where the depth is unknown. For a monocular source, it is None.
         sides: a function that decodes only the left image, and a function that decodes only the
             right image. None if both images can only be decoded together, or if there is no right
             image.

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.png import decode_with_opencv
-from vslam.untrusted import is_image
+from vslam.support.untrusted import is_image
 
 Levels = NDArray[np.uint8]  # (65536,) the 8-bit grey level of each 16-bit value
 

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration.models import Calibration
-from vslam.camera import Camera, DepthImage, Image
 from vslam.datasets.association import Pairing
 from vslam.datasets.frames import RawSource, Size, TimedFrame, check_selection, decoded
 from vslam.datasets.grey_levels import Levels, decode, levels_of_files
 from vslam.datasets.times import Number, Timing
-from vslam.errors import InputError, UnreadableImageError
-from vslam.file_kinds import read_text, why_not_an_image
-from vslam.untrusted import MOST_PIXELS, is_float_depth, is_image, read_npy, require_utf8
+from vslam.support.errors import InputError, UnreadableImageError
+from vslam.support.file_kinds import read_text, why_not_an_image
+from vslam.support.untrusted import MOST_PIXELS, is_float_depth, is_image, read_npy, require_utf8
+from vslam.types.camera import Camera, DepthImage, Image
 
 # Distance in metres between the projector and the camera of a Kinect (ORB-SLAM2, section III-A).
 _VIRTUAL_BASELINE = 0.08

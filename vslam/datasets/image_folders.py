@@ -49,8 +49,8 @@ from vslam.datasets.times import (
     times_of_list,
     times_of_names,
 )
-from vslam.errors import InputError
-from vslam.file_kinds import identify, what_is_in
+from vslam.support.errors import InputError
+from vslam.support.file_kinds import identify, what_is_in
 
 PAIRS = (
     ("left", "right"),

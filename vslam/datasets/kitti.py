@@ -20,14 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration import files as calibration_files
-from vslam.camera import Camera
 from vslam.datasets.frames import Source
 from vslam.datasets.image_files import checked_files, list_images, select_frames
 from vslam.datasets.rectified import rectified
 from vslam.datasets.times import FIX_LIST, ordered_list, times_of_list
-from vslam.errors import InputError, UnreadableImageError
-from vslam.file_kinds import read_text, what_is_in
-from vslam.trajectory import read_kitti_poses
+from vslam.support.errors import InputError, UnreadableImageError
+from vslam.support.file_kinds import read_text, what_is_in
+from vslam.types.camera import Camera
+from vslam.types.trajectory import read_kitti_poses
 
 _HOME = "https://www.cvlibs.net/datasets/kitti/eval_odometry.php"
 _FIX = "take calib.txt of this sequence from KITTI's calibration files"

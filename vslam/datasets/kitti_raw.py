@@ -26,8 +26,8 @@ from vslam.datasets.image_files import checked_files, find_sequence, select_fram
 from vslam.datasets.kitti import files_of_frames, find_cameras, row_numbers
 from vslam.datasets.rectified import rectified
 from vslam.datasets.times import FIX_LIST, ordered_list, times_of_list
-from vslam.errors import InputError
-from vslam.file_kinds import what_is_in
+from vslam.support.errors import InputError
+from vslam.support.file_kinds import what_is_in
 
 _CALIBRATION = "calib_cam_to_cam.txt"
 

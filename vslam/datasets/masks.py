@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from vslam.camera import Image
 from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.image_files import list_images, read_grey, size_text
-from vslam.errors import InputError, UnreadableImageError
+from vslam.support.errors import InputError, UnreadableImageError
+from vslam.types.camera import Image
 
 ReadMask = Callable[[], Image]
 

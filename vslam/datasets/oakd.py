@@ -17,7 +17,7 @@ import numpy as np
 
 from vslam.calibration.models import Calibration, CameraModel
 from vslam.datasets.depth_cameras import FPS, TIMEOUT_S, DepthCamera, Grabbed, maker_package
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 _SIZE = 640, 400
 _DEPTH_SCALE = 1000.0  # depth image units per metre

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from vslam.camera import Camera, DepthImage, Image, ImageMap
 from vslam.datasets.frames import Images, Source, TimedFrame, selected
-from vslam.errors import BrokenSourceError, InputError, UnreadableImageError
-from vslam.plugins import PlugIn, reason
+from vslam.support.errors import BrokenSourceError, InputError, UnreadableImageError
+from vslam.support.plugins import PlugIn, reason
+from vslam.types.camera import Camera, DepthImage, Image, ImageMap
 
 
 def open_plugin(
@@ -62,7 +62,7 @@ def _wrong_source(raw: object) -> str:
     if not isinstance(raw, Source):
         return f"returned {type(raw).__name__}, not vslam.datasets.frames.Source"
     if not isinstance(raw.camera, Camera):
-        return f"camera is {type(raw.camera).__name__}, not vslam.camera.Camera"
+        return f"camera is {type(raw.camera).__name__}, not vslam.types.camera.Camera"
     if wrong := [frame for frame in raw.stored if not isinstance(frame, TimedFrame)]:
         return f"stored has a {type(wrong[0]).__name__}, not vslam.datasets.frames.TimedFrame"
     n = raw.n_expected

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.kernels import inline, inner_kernel, kernel
-from vslam.untrusted import MOST_PIXELS
+from vslam.support.kernels import inline, inner_kernel, kernel
+from vslam.support.untrusted import MOST_PIXELS
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 GREY_8_BITS = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method, no interlacing

@@ -16,7 +16,7 @@ import numpy as np
 
 from vslam.calibration.models import Calibration, CameraModel, without_zeros
 from vslam.datasets.depth_cameras import FPS, TIMEOUT_S, DepthCamera, Grabbed, maker_package
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 _SIZE = 848, 480  # recommended by Intel for the depth of these cameras
 

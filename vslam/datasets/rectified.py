@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from vslam.calibration.models import Calibration
 from vslam.calibration.rectification import Rectification, rectify
-from vslam.camera import DepthImage, Image, ImageMap
 from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame, decoded
 from vslam.datasets.image_files import with_depth
-from vslam.errors import InputError
+from vslam.support.errors import InputError
+from vslam.types.camera import DepthImage, Image, ImageMap
 
 # Names of what an encoder has cut off, by the numbers of missing columns and rows.
 _MISSING = {(1, 0): "column", (0, 1): "row", (1, 1): "column and row"}

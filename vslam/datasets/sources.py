@@ -17,7 +17,7 @@ from vslam.datasets.image_files import depth_scale_of, list_images
 from vslam.datasets.kitti_raw import is_kitti_raw
 from vslam.datasets.masks import with_masks
 from vslam.datasets.rectified import rectified
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 DEPTH_CAMERAS = ("realsense", "oakd")
 LIVE = ("camera", *DEPTH_CAMERAS)

@@ -21,9 +21,9 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, counted
-from vslam.file_kinds import read_text
-from vslam.trajectory import read_table
+from vslam.support.errors import InputError, counted
+from vslam.support.file_kinds import read_text
+from vslam.types.trajectory import read_table
 
 Number = int | float | Decimal
 Times = NDArray[np.float64]

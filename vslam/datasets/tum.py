@@ -33,8 +33,8 @@ from vslam.datasets.image_files import (
 )
 from vslam.datasets.rectified import rectified
 from vslam.datasets.times import FIX_LIST, UNITS, Timing, ordered_list, unit_of_list
-from vslam.errors import InputError
-from vslam.file_kinds import what_is_in
+from vslam.support.errors import InputError
+from vslam.support.file_kinds import what_is_in
 
 _HOME = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset"
 CALIBRATION = "calibration.yaml"

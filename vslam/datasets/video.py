@@ -19,12 +19,12 @@ from urllib.parse import urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Image, ImageMap
 from vslam.datasets.frames import RawSource, Size, TimedFrame
 from vslam.datasets.grey_levels import Levels, levels_of
-from vslam.errors import BrokenSourceError, InputError
-from vslam.file_kinds import identify
-from vslam.untrusted import MOST_PIXELS
+from vslam.support.errors import BrokenSourceError, InputError
+from vslam.support.file_kinds import identify
+from vslam.support.untrusted import MOST_PIXELS
+from vslam.types.camera import Image, ImageMap
 
 _log = logging.getLogger(__name__)
 

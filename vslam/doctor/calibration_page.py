@@ -12,10 +12,10 @@ from vslam.calibration.models import Array
 from vslam.calibration.rectification import rectify
 from vslam.calibration.solve import CameraFit, Estimate
 from vslam.doctor.findings import Finding, judge, sections
-from vslam.errors import InputError, write_file
 from vslam.report.drawing import BLUE, GREY, LOW, RED, Drawing, draw, new_figure
 from vslam.report.page import Code, Page, Section, Tile, Tiles
 from vslam.report.render import html
+from vslam.support.errors import InputError, write_file
 
 _FEW_VIEWS = 10
 # A view counts as tilted above the first number, in degrees. The second number is the least number

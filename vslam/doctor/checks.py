@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, Image, calibration_doubts, field_of_view
 from vslam.config import StereoConfig
 from vslam.datasets.times import (
     GAP,
@@ -25,10 +24,11 @@ from vslam.datasets.times import (
 )
 from vslam.doctor.findings import Finding, judge
 from vslam.doctor.focal_length import FocalFit
-from vslam.errors import counted
 from vslam.run.matching import Matches, count_views
 from vslam.run.pair import ROWS_PX, find_lag, judge_sides, row_error
 from vslam.run.side_delay import SideDelay
+from vslam.support.errors import counted
+from vslam.types.camera import Camera, Image, calibration_doubts, field_of_view
 
 Times = NDArray[np.float64]
 Depth = NDArray[Any]  # any type of number; 0 or NaN means that the depth is missing

@@ -13,14 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, DepthImage, Image
 from vslam.config import Config
-from vslam.context import Context
 from vslam.datasets.frames import Source
 from vslam.doctor import checks
 from vslam.doctor.findings import Finding, judge, sections
 from vslam.doctor.focal_length import Moved, fit_focal_length
-from vslam.errors import UnreadableImageError, counted, write_file
 from vslam.frontend.extraction import find_corners
 from vslam.frontend.masks import Mask
 from vslam.report.page import Figure, Page, Section
@@ -28,6 +25,9 @@ from vslam.report.render import html
 from vslam.run.matching import Matches, joined, match_images
 from vslam.run.pair import ROWS_PX, row_error
 from vslam.run.side_delay import measure_delay
+from vslam.support.errors import UnreadableImageError, counted, write_file
+from vslam.types.camera import Camera, DepthImage, Image
+from vslam.types.context import Context
 
 _FRAMES = 8  # number of examined frames, which are spread over the sequence
 _LAGS = range(-2, 3)  # delays of the right image that are tried, in frames

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
+from vslam.types.camera import Camera
 
 Vectors = NDArray[np.float64]
 

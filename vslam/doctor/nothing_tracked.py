@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from vslam.errors import counted
 from vslam.run.outcome import RunOutcome
+from vslam.support.errors import counted
 
 
 def why_nothing_was_tracked(outcome: RunOutcome) -> str | None:

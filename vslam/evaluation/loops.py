@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.evaluation.trajectories import path_length
-from vslam.geometry import inverses
-from vslam.loops import LoopEdge
 from vslam.run.outcome import RunOutcome, ground_truth_of
+from vslam.types.geometry import inverses
+from vslam.types.loops import LoopEdge
 
 # Definition of a revisit.
 MIN_LENGTH_M = 20.0  # least length of a stretch

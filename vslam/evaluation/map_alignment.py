@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from vslam.evaluation.trajectories import Evaluation
-from vslam.geometry import Matrix
 from vslam.maps.stored_map import TruthAlignment
 from vslam.run.outcome import RunOutcome
+from vslam.types.geometry import Matrix
 
 
 def name_of_world(outcome: RunOutcome) -> str:

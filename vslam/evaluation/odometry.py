@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import TrackResult
-from vslam.geometry import Matrix, inverse, orthonormalised, se3_log
-from vslam.odometry import relative_covariance
-from vslam.trajectory import Trajectory
+from vslam.types.features import TrackResult
+from vslam.types.geometry import Matrix, inverse, orthonormalised, se3_log
+from vslam.types.odometry import relative_covariance
+from vslam.types.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,8 @@ from vslam.datasets.association import (
     said_of_unit,
 )
 from vslam.datasets.times import read_times
-from vslam.errors import InputError, counted
-from vslam.trajectory import (
+from vslam.support.errors import InputError, counted
+from vslam.types.trajectory import (
     Format,
     Trajectory,
     read_trajectory,

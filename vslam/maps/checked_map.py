@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
-from vslam.frame_poses import FrameTable
-from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe
-from vslam.map import (
+from vslam.maps.checkpoint import checked_checkpoint
+from vslam.maps.stored_map import StoredMap, TruthAlignment, observations
+from vslam.types.camera import Camera
+from vslam.types.frame_poses import FrameTable
+from vslam.types.loops import DetectorMemory, LoopEdge, PerKeyframe
+from vslam.types.map import (
     KEYFRAME_FIELDS,
     LANDMARK_FIELDS,
     NONE,
@@ -26,9 +28,7 @@ from vslam.map import (
     Map,
     Scalars,
 )
-from vslam.maps.checkpoint import checked_checkpoint
-from vslam.maps.stored_map import StoredMap, TruthAlignment, observations
-from vslam.revisits import Revisits
+from vslam.types.revisits import Revisits
 
 # These columns are not in the file. They are computed from keyframe_first_row and from the list of
 # observations, which is sorted by landmark.

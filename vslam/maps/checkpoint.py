@@ -1,4 +1,4 @@
-"""Stores a checkpoint of SLAM (``vslam.states.Checkpoint``) in a map file."""
+"""Stores a checkpoint of SLAM (``vslam.types.states.Checkpoint``) in a map file."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.features import PATCH_PIXELS
-from vslam.map import Map
 from vslam.maps.codec import Codec
-from vslam.states import Checkpoint, MapperState, TrackerState
+from vslam.types.features import PATCH_PIXELS
+from vslam.types.map import Map
+from vslam.types.states import Checkpoint, MapperState, TrackerState
 
 SCHEMA = 3
 _MOST = 1e12  # metres, pixels or seconds

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.maps.reconstruction import PIXEL_CENTRE, Reconstruction
-from vslam.trajectory import quaternions
+from vslam.types.camera import Camera
+from vslam.types.trajectory import quaternions
 
 _CAMERA_ID = 1
 _PINHOLE = 1  # number of this model in COLMAP's camera_models

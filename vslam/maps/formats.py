@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.maps.reconstruction import PIXEL_CENTRE, Reconstruction
-from vslam.trajectory import quaternions
+from vslam.types.trajectory import quaternions
 
 POINTS = "sparse_pc.ply"
 # The axes of nerfstudio's world frame point right, forward and up, as seen from the first camera.

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from vslam.errors import InputError, ResultsError
+from vslam.support.errors import InputError, ResultsError
 
 
 @contextmanager

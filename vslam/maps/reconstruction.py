@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
-from vslam.geometry import inverses
-from vslam.map import Map
+from vslam.types.camera import Camera
+from vslam.types.geometry import inverses
+from vslam.types.map import Map
 
 # Coordinates of the centre of the upper left pixel in formats whose pixel coordinates begin at the
 # corner of the image. In vslam this centre is (0, 0).

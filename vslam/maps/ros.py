@@ -22,10 +22,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
-from vslam.features import TrackResult
-from vslam.geometry import Matrix, adjoint, inverse, inverses, se3_log
-from vslam.trajectory import Trajectory, quaternions
+from vslam.support.errors import InputError
+from vslam.types.features import TrackResult
+from vslam.types.geometry import Matrix, adjoint, inverse, inverses, se3_log
+from vslam.types.trajectory import Trajectory, quaternions
 
 MAP, ODOM, BASE, OPTICAL = "map", "odom", "base_link", "camera_optical"
 Types = Callable[[str], Any]

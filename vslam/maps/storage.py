@@ -17,17 +17,17 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
-from vslam.errors import InputError
-from vslam.frame_poses import FrameTable
-from vslam.machine import versions
-from vslam.map_kernels import gather_observations, resolve
 from vslam.maps.checked_map import FILE_NAMES, DamagedMapError, camera_of, checked_map
 from vslam.maps.checkpoint import CHECKPOINTS
 from vslam.maps.checkpoint import SCHEMA as CHECKPOINT_SCHEMA
 from vslam.maps.new_output import replaced_file
 from vslam.maps.stored_map import StoredMap
-from vslam.untrusted import ARCHIVE_ERRORS, read_json, require_memory
+from vslam.support.errors import InputError
+from vslam.support.machine import versions
+from vslam.support.untrusted import ARCHIVE_ERRORS, read_json, require_memory
+from vslam.types.camera import Camera
+from vslam.types.frame_poses import FrameTable
+from vslam.types.map_kernels import gather_observations, resolve
 
 SCHEMA = 10
 _UNKNOWN = np.full((6, 6), np.nan)  # covariance

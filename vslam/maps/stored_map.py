@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
-from vslam.frame_poses import FrameTable
-from vslam.geometry import inverses, orthonormalised
-from vslam.loops import DetectorMemory, LoopEdge, PerKeyframe, ranges
-from vslam.map import (
+from vslam.types.camera import Camera
+from vslam.types.frame_poses import FrameTable
+from vslam.types.geometry import inverses, orthonormalised
+from vslam.types.loops import DetectorMemory, LoopEdge, PerKeyframe, ranges
+from vslam.types.map import (
     KEYFRAME_FIELDS,
     LANDMARK_FIELDS,
     NONE,
@@ -24,8 +24,8 @@ from vslam.map import (
     loop_of_living,
     revisits_of_living,
 )
-from vslam.map_kernels import gather_observations, resolve
-from vslam.states import Checkpoint
+from vslam.types.map_kernels import gather_observations, resolve
+from vslam.types.states import Checkpoint
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from vslam.features import TrackingState
 from vslam.report import page
+from vslam.types.features import TrackingState
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from vslam.evaluation.loops import LoopEvaluation
 from vslam.evaluation.odometry import MotionErrors, motion_errors
 from vslam.evaluation.trajectories import Evaluation
-from vslam.features import TrackingState
 from vslam.report import page
 from vslam.report.drawing import (
     AMBER,
@@ -34,6 +33,7 @@ from vslam.report.drawing import (
 from vslam.report.summary import stage_names
 from vslam.report.trajectory_figures import gps_map, loop_closing, top_view
 from vslam.run.outcome import RunOutcome
+from vslam.types.features import TrackingState
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

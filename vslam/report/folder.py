@@ -12,19 +12,19 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vslam.errors import InputError, ResultsError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.map_alignment import truth_alignment_of
 from vslam.evaluation.trajectories import Evaluation, evo_command
-from vslam.gaps import Gap
 from vslam.maps.formats import save_ply
 from vslam.maps.storage import save_map
+from vslam.method.gaps import Gap
 from vslam.report.frame_table import write_covariances, write_frames
 from vslam.report.render import csv_text
 from vslam.report.schema import ReportJson
 from vslam.report.summary import evaluate_run, gps_figures, summarize
 from vslam.run.outcome import RunOutcome, causal_trajectory, odometry_trajectory
-from vslam.trajectory import write_kitti, write_tum
+from vslam.support.errors import InputError, ResultsError
+from vslam.types.trajectory import write_kitti, write_tum
 
 if TYPE_CHECKING:
     from vslam.report.page import Figure
@@ -96,8 +96,8 @@ def write_results(
     still written. These are the files:
 
     - trajectories: ``trajectory_kitti.txt``, ``trajectory.tum``, ``gaps.csv`` (the gaps of these
-      two, if there are any; ``vslam.gaps.Gap``), ``ground_truth_kitti.txt``, ``keyframes.tum``,
-      ``trajectory_causal.tum`` (poses at the time of tracking),
+      two, if there are any; ``vslam.method.gaps.Gap``), ``ground_truth_kitti.txt``,
+      ``keyframes.tum``, ``trajectory_causal.tum`` (poses at the time of tracking),
       ``covariance.csv`` (covariances of these poses), ``trajectory_odom.tum`` (poses from odometry,
       which never jump), and ``trajectory_<detector>.tum`` for each detector of ``--compare``. With
       GPS, ``trajectory_enu.tum``, ``trajectory_gps.csv`` and ``gps.json`` are also written;

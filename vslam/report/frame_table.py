@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
-from vslam.features import TrackResult
 from vslam.report.summary import stage_names
+from vslam.support.errors import InputError
+from vslam.types.features import TrackResult
 
 _COUNTS = ("n_features", "n_stereo", "n_matches", "n_inliers")
 _SIGMAS = ("sigma_m", "sigma_deg", "drift_m", "drift_deg")
@@ -59,9 +59,9 @@ def write_covariances(path: Path, tracks: list[TrackResult]) -> None:
     The columns are the timestamp (s) and the upper triangles of two covariances, row by row.
 
     The two matrices are covariances of ``[x, y, z, rx, ry, rz]`` in metres and radians, in the
-    frame of the camera (``vslam.odometry``). The first covariance describes the pose relative to
-    the landmarks around the camera (``local``). The second covariance describes the pose relative
-    to the start of the drive (``drive``).
+    frame of the camera (``vslam.types.odometry``). The first covariance describes the pose relative
+    to the landmarks around the camera (``local``). The second covariance describes the pose
+    relative to the start of the drive (``drive``).
     """
     upper = np.triu_indices(6)
     pairs = [f"{_AXES[row]}_{_AXES[column]}" for row, column in zip(*upper, strict=True)]

@@ -10,9 +10,9 @@ from collections import defaultdict
 from collections.abc import Collection
 from typing import TYPE_CHECKING
 
-from vslam.errors import counted
 from vslam.report.page import Figure, Row, Section, Table, number
 from vslam.report.schema import LoopEntry, ReportJson
+from vslam.support.errors import counted
 
 if TYPE_CHECKING:
     from vslam.run.loop_pictures import LoopPicture

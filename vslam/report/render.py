@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from vslam.errors import write_file
 from vslam.report.page import (
     Alert,
     Bullets,
@@ -25,6 +24,7 @@ from vslam.report.page import (
     Table,
     Tiles,
 )
+from vslam.support.errors import write_file
 
 if TYPE_CHECKING:
     from rich.console import Console

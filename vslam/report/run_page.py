@@ -6,7 +6,6 @@ from collections.abc import Collection
 from html import escape
 
 from vslam.config import thresholds_in_words
-from vslam.errors import counted
 from vslam.evaluation.loops import MIN_LENGTH_M
 from vslam.loopclosure.registry import about
 from vslam.report.loop_tables import loop_sections, seen_note
@@ -27,6 +26,7 @@ from vslam.report.page import (
     number,
 )
 from vslam.report.schema import ReportJson
+from vslam.support.errors import counted
 
 _ALIGNMENTS = {
     "se3": "SE3 alignment, no scale",

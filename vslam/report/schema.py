@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-from vslam.errors import InputError
-from vslam.gaps import GapKind
+from vslam.method.gaps import GapKind
+from vslam.support.errors import InputError
 
 
 class Record(BaseModel):
@@ -152,7 +152,7 @@ class DetectorFigures(Measures):
 class GapEntry(Record):
     """A stretch of frames whose final poses relative to the world frame were not measured.
 
-    The fields are those of ``vslam.gaps.Gap``.
+    The fields are those of ``vslam.method.gaps.Gap``.
     """
 
     kind: GapKind

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import changed_thresholds
-from vslam.errors import InputError
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.map_alignment import error_in_map
 from vslam.evaluation.trajectories import (
@@ -22,11 +21,7 @@ from vslam.evaluation.trajectories import (
     evaluate_trajectory,
     evaluation_warnings,
 )
-from vslam.features import TrackingState, TrackResult
-from vslam.geometry import inverses
-from vslam.loops import LoopCorrection
-from vslam.machine import available_cores, cpu_name, versions
-from vslam.method import METHOD_VERSION
+from vslam.method.version import METHOD_VERSION
 from vslam.report.schema import (
     DetectorFigures,
     GapEntry,
@@ -39,6 +34,11 @@ from vslam.report.schema import (
     StageTime,
 )
 from vslam.run.outcome import RunOutcome, causal_trajectory
+from vslam.support.errors import InputError
+from vslam.support.machine import available_cores, cpu_name, versions
+from vslam.types.features import TrackingState, TrackResult
+from vslam.types.geometry import inverses
+from vslam.types.loops import LoopCorrection
 
 _OPTIONS = (
     "perturb", "detector", "seed", "threads", "start", "every", "max_frames", "weights",

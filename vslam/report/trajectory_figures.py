@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from vslam.evaluation.loops import LoopEvaluation
 from vslam.evaluation.map_alignment import truth_alignment_of
 from vslam.evaluation.trajectories import Evaluation
-from vslam.geometry import inverses
 from vslam.report.drawing import (
     AMBER,
     BLUE,
@@ -30,6 +29,7 @@ from vslam.report.drawing import (
 )
 from vslam.report.summary import evaluate_run
 from vslam.run.outcome import RunOutcome
+from vslam.types.geometry import inverses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

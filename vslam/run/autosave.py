@@ -19,15 +19,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TextIO
 
-from vslam.errors import InputError
-from vslam.features import TrackResult
-from vslam.lock_file import locked
 from vslam.maps.new_output import replaced_file
 from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
 from vslam.run.progress import Progress, read_progress, write_progress
 from vslam.slam import Slam
-from vslam.trajectory import tum_line
+from vslam.support.errors import InputError
+from vslam.support.lock_file import locked
+from vslam.types.features import TrackResult
+from vslam.types.trajectory import tum_line
 
 MAP, PROGRESS, ONLINE = "autosave.npz", "autosave_progress.npz", "trajectory_online.tum"
 LOCK = ".lock"

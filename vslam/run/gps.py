@@ -11,11 +11,11 @@ from vslam.backend.gps import Anchored, Positions, anchor
 from vslam.backend.pose_graph import essential_graph
 from vslam.config import PoseGraphConfig
 from vslam.datasets.fixes import Fixes, to_enu, to_geodetic
-from vslam.errors import InputError
-from vslam.frame_poses import FrameTable
-from vslam.geometry import inverses
 from vslam.maps.stored_map import StoredMap
-from vslam.trajectory import Trajectory, bridge_gaps
+from vslam.support.errors import InputError
+from vslam.types.frame_poses import FrameTable
+from vslam.types.geometry import inverses
+from vslam.types.trajectory import Trajectory, bridge_gaps
 
 _LONGEST_S = 0.5  # no position is interpolated between two frames with a longer interval
 

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.loopclosure.learned_localisation import project
-from vslam.loops import LoopEdge
-from vslam.map import NONE, Map
+from vslam.types.camera import Camera
+from vslam.types.loops import LoopEdge
+from vslam.types.map import NONE, Map
 
 _PANEL_WIDTH, _GUTTER = 640, 8  # width of a panel and of the space between panels, in pixels
 _QUALITY = 80

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Image
 from vslam.config import Config
 from vslam.frontend.weak_images import is_faint, with_contrast
+from vslam.types.camera import Image
 
 _FEATURES = 2000
 _CONFIG = Config.model_validate({"orb": {"n_features": _FEATURES}})

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, Image
-from vslam.features import TrackResult
-from vslam.loops import LoopEdge
-from vslam.map import Map
 from vslam.run.loop_pictures import LoopPicture, loop_matches, spread
 from vslam.run.recorder import Recorder
-from vslam.trajectory import Trajectory
+from vslam.types.camera import Camera, Image
+from vslam.types.features import TrackResult
+from vslam.types.loops import LoopEdge
+from vslam.types.map import Map
+from vslam.types.trajectory import Trajectory
 
 _MOST = 96  # images; they take about 1 MB of the page
 _WIDTH = 360  # pixels, of an image

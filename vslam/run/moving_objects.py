@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from vslam.features import TrackResult
+from vslam.types.features import TrackResult
 
 # In ordinary drives, at most 5 frames in a row have so little support (hand-held walk; KITTI 1).
 _LITTLE, _FRAMES = 0.4, 10

@@ -9,9 +9,9 @@ from pydantic import ValidationError
 
 from vslam.config import Config
 from vslam.datasets.sources import SourceOptions
-from vslam.errors import InputError
 from vslam.loopclosure.registry import DEFAULT_DETECTOR
-from vslam.plugins import packages_of
+from vslam.support.errors import InputError
+from vslam.support.plugins import packages_of
 
 OPTIONS = "run.json"
 

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from vslam.datasets.association import poses_at
 from vslam.datasets.frames import Source
-from vslam.features import TrackingState, TrackResult
-from vslam.gaps import Gap, sentences
-from vslam.loops import LoopCorrection, LoopEdge
-from vslam.map import Map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
+from vslam.method.gaps import Gap, sentences
 from vslam.run.options import RunOptions
-from vslam.trajectory import Trajectory
+from vslam.types.features import TrackingState, TrackResult
+from vslam.types.loops import LoopCorrection, LoopEdge
+from vslam.types.map import Map
+from vslam.types.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from vslam.run.gps import GpsTrack

@@ -16,14 +16,14 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from vslam.camera import Camera, Image
 from vslam.datasets.frames import Source, TimedFrame, first_frames
 from vslam.datasets.perturbation import Perturbation, perturbed
-from vslam.errors import InputError, UnreadableImageError, counted
-from vslam.plugins import reason
 from vslam.run.matching import Described, Matches, describe, match_described
 from vslam.run.options import RunOptions
 from vslam.run.side_delay import FEWEST_FRAMES, delay_warnings, measure_delay
+from vslam.support.errors import InputError, UnreadableImageError, counted
+from vslam.support.plugins import reason
+from vslam.types.camera import Camera, Image
 
 ROWS_PX = 0.8
 """Largest median vertical error of stereo matches. A run searches for stereo matches within 2 rows.

@@ -17,18 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, same_camera
 from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.times import jitter_warnings
-from vslam.errors import BrokenSourceError, InputError
-from vslam.features import TrackingState, TrackResult
 from vslam.loopclosure.registry import detector_with_images, problem_of
-from vslam.loops import LoopCorrection, LoopEdge
-from vslam.machine import give_back_memory, peak_memory_mb, process_age
-from vslam.map import Map
 from vslam.maps.storage import made_with
-from vslam.plugins import reason
 from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
 from vslam.run.moving_objects import moving_object_warnings
 from vslam.run.options import RunOptions
@@ -44,7 +37,14 @@ from vslam.run.rig import (
     rig_warnings,
 )
 from vslam.slam import Slam
-from vslam.trajectory import Trajectory
+from vslam.support.errors import BrokenSourceError, InputError
+from vslam.support.machine import give_back_memory, peak_memory_mb, process_age
+from vslam.support.plugins import reason
+from vslam.types.camera import Camera, same_camera
+from vslam.types.features import TrackingState, TrackResult
+from vslam.types.loops import LoopCorrection, LoopEdge
+from vslam.types.map import Map
+from vslam.types.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
 

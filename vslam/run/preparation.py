@@ -18,14 +18,14 @@ from functools import lru_cache, partial
 from queue import SimpleQueue
 from typing import Generic, TypeVar
 
-from vslam.camera import DepthImage, Image, ImageMap
 from vslam.config import OrbConfig
-from vslam.context import Context
 from vslam.datasets.frames import TimedFrame
-from vslam.errors import DroppedFrameError, UnreadableImageError
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.masks import Mask
-from vslam.workers import Job, Urgency, Workers
+from vslam.support.errors import DroppedFrameError, UnreadableImageError
+from vslam.support.workers import Job, Urgency, Workers
+from vslam.types.camera import DepthImage, Image, ImageMap
+from vslam.types.context import Context
 
 T = TypeVar("T")
 

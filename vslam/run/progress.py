@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
-from vslam.features import TrackingState, TrackResult
-from vslam.loops import LoopCorrection, LoopEdge
 from vslam.maps.checkpoint import LOOP_SHAPES
 from vslam.maps.codec import Codec
 from vslam.maps.new_output import replaced_file
-from vslam.odometry import N_NUMBERS, PoseUncertainty
-from vslam.untrusted import ARCHIVE_ERRORS, read_json, read_npz
+from vslam.support.errors import InputError
+from vslam.support.untrusted import ARCHIVE_ERRORS, read_json, read_npz
+from vslam.types.features import TrackingState, TrackResult
+from vslam.types.loops import LoopCorrection, LoopEdge
+from vslam.types.odometry import N_NUMBERS, PoseUncertainty
 
 SCHEMA = 7
 _STATES = tuple(TrackingState)

@@ -27,15 +27,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, Image
-from vslam.errors import InputError
-from vslam.features import TrackingState, TrackResult
-from vslam.geometry import inverses
-from vslam.loops import LoopEdge
-from vslam.map import Map
-from vslam.plugins import reason
 from vslam.run.loop_pictures import LoopPicture, draw_picture
-from vslam.trajectory import Trajectory
+from vslam.support.errors import InputError
+from vslam.support.plugins import reason
+from vslam.types.camera import Camera, Image
+from vslam.types.features import TrackingState, TrackResult
+from vslam.types.geometry import inverses
+from vslam.types.loops import LoopEdge
+from vslam.types.map import Map
+from vslam.types.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, calibration_doubts
-from vslam.geometry import compose, inverse, orthonormalised, se3_log
-from vslam.map import Map
-from vslam.states import ComparedSides
+from vslam.types.camera import Camera, calibration_doubts
+from vslam.types.geometry import compose, inverse, orthonormalised, se3_log
+from vslam.types.map import Map
+from vslam.types.states import ComparedSides
 
 _FEWEST = 3  # frames; fewer may be caused by a reflection or a hand in front of the lens
 _FEWEST_OBSERVATIONS, _MOST_OBSERVATIONS = 3_000, 100_000

@@ -26,11 +26,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, Image
 from vslam.config import StereoConfig
 from vslam.datasets.frames import TimedFrame
-from vslam.errors import UnreadableImageError
 from vslam.run.matching import describe, match_described
+from vslam.support.errors import UnreadableImageError
+from vslam.types.camera import Camera, Image
 
 _FEATURES = 1000
 _FEWEST, _MOST = 10, 32  # measured frames

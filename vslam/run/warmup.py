@@ -50,12 +50,8 @@ from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.global_mapping import merge_solution, take_snapshot
 from vslam.backend.loop_correction import move_keyframes
 from vslam.backend.pose_graph import check_pose_graph, essential_graph, load_optimiser
-from vslam.camera import Camera
-from vslam.closing import LoopClosing
 from vslam.config import Config, DepthConfig, KeyframeConfig, MappingConfig, TrackingConfig
-from vslam.context import Context
 from vslam.datasets.png import unfilter
-from vslam.features import Extracted, Features, TrackingState
 from vslam.frontend import pnp
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
@@ -68,13 +64,17 @@ from vslam.loopclosure.local_matching import DescriptorMaps, locate, locate_near
 from vslam.loopclosure.verification import verify
 from vslam.loopclosure.verifier import Verifier
 from vslam.loopclosure.vocabulary import Vocabulary, from_children
-from vslam.loops import LoopCandidate, LoopEdge
-from vslam.machine import available_cores
-from vslam.map import Map
-from vslam.map_view import local_map
-from vslam.mapping import Mapper
+from vslam.method.closing import LoopClosing
+from vslam.method.mapping import Mapper
 from vslam.slam import Slam
-from vslam.workers import Workers
+from vslam.support.machine import available_cores
+from vslam.support.workers import Workers
+from vslam.types.camera import Camera
+from vslam.types.context import Context
+from vslam.types.features import Extracted, Features, TrackingState
+from vslam.types.loops import LoopCandidate, LoopEdge
+from vslam.types.map import Map
+from vslam.types.map_view import local_map
 
 WIDTH, HEIGHT, DISPARITY, STEP, FRAMES = 480, 240, 12, 6, 6
 CAMERA = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)

@@ -35,7 +35,7 @@ from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.maps.storage import load_map
 from vslam.run.gps import locate
 from vslam.run.outcome import alignment_of
-from vslam.trajectory import Trajectory, read_trajectory
+from vslam.types.trajectory import Trajectory, read_trajectory
 
 DATUM = np.array([49.0, 8.4, 115.0])
 # The axes x, y and z of the ground truth point right, down and ahead of the camera at the first

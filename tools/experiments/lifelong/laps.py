@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.report.schema import ReportJson
-from vslam.trajectory import read_kitti_poses, read_trajectory, write_kitti
+from vslam.support.errors import InputError
+from vslam.types.trajectory import read_kitti_poses, read_trajectory, write_kitti
 
 Indices = NDArray[np.int64]
 

@@ -24,16 +24,16 @@ from scipy.special import expit
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import parse_perturbation, perturbed
-from vslam.geometry import inverse, se3_log
 from vslam.loopclosure import verification
 from vslam.loopclosure.evidence import Weights
 from vslam.loopclosure.learned_verification import verify_learned
 from vslam.loopclosure.local_matching import likeness
 from vslam.loopclosure.registry import create_images
-from vslam.loops import LoopCandidate, LoopEdge, LoopEvidence
-from vslam.map import Map
 from vslam.run.outcome import ground_truth_of
 from vslam.slam import Slam
+from vslam.types.geometry import inverse, se3_log
+from vslam.types.loops import LoopCandidate, LoopEdge, LoopEvidence
+from vslam.types.map import Map
 
 COLUMNS = ["drive", "perturb", "query", "match", "matched_by", *LoopEvidence._fields]
 ERRORS = ["metres", "degrees"]

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.features import TrackingState
 from vslam.frontend.masks import Mask
 from vslam.slam import Slam
-from vslam.trajectory import Trajectory
+from vslam.types.features import TrackingState
+from vslam.types.trajectory import Trajectory
 
 DISPARITY = 90  # disparity of the hood in pixels; it is large because the hood is near
 

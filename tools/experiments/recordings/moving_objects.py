@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam import METHOD_VERSION
-from vslam.camera import Camera, Image
 from vslam.datasets.synthetic.passes import Passes
 from vslam.datasets.synthetic.render import Renderer, sensor_image
 from vslam.datasets.synthetic.routes import CAMERA_HEIGHT, Route, built_in_route
@@ -30,9 +29,10 @@ from vslam.datasets.synthetic.scene import Surfaces, join
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.solids import box, turn
 from vslam.datasets.synthetic.town import Town, build_town
-from vslam.features import TrackingState
-from vslam.geometry import inverse
 from vslam.slam import Slam
+from vslam.types.camera import Camera, Image
+from vslam.types.features import TrackingState
+from vslam.types.geometry import inverse
 
 STEP_S = 0.1
 FRAMES = 80

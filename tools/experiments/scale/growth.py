@@ -26,17 +26,17 @@ from numpy.typing import NDArray
 from vslam.backend.bundle_adjustment import BundleProblem
 from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.pose_graph import check_pose_graph, essential_graph, optimise
-from vslam.camera import Camera
 from vslam.config import Config
-from vslam.features import Features
-from vslam.geometry import compose, inverse, inverses, se3_exp
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.vocabulary import load
-from vslam.loops import LoopEdge, PerKeyframe
-from vslam.machine import peak_memory_mb
-from vslam.map import Map
-from vslam.map_kernels import link_many
-from vslam.map_view import local_map
+from vslam.support.machine import peak_memory_mb
+from vslam.types.camera import Camera
+from vslam.types.features import Features
+from vslam.types.geometry import compose, inverse, inverses, se3_exp
+from vslam.types.loops import LoopEdge, PerKeyframe
+from vslam.types.map import Map
+from vslam.types.map_kernels import link_many
+from vslam.types.map_view import local_map
 
 CAMERA = Camera(718.856, 718.856, 607.2, 185.2, 0.54, 1241, 376)
 STEP_M, BLOCK = 5.0, 20  # between keyframes; number of keyframes between crossings

@@ -24,12 +24,12 @@ from vslam.cli.export import ros
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import open_source
 from vslam.frontend import tracking
-from vslam.odometry import Odometry
 from vslam.report.folder import write_results
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.types.odometry import Odometry
 
 
 def main() -> None:

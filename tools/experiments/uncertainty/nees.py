@@ -26,10 +26,10 @@ from vslam.datasets import open_sequence
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation, perturbed
 from vslam.evaluation.odometry import motion_errors
-from vslam.features import TrackResult
-from vslam.geometry import inverse, se3_log
 from vslam.slam import Slam
-from vslam.trajectory import Trajectory
+from vslam.types.features import TrackResult
+from vslam.types.geometry import inverse, se3_log
+from vslam.types.trajectory import Trajectory
 
 Float = NDArray[np.float64]
 INFLATION = Config().pose_graph.loop_inflation

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, DepthImage, Image
+from vslam.types.camera import Camera, DepthImage, Image
 
 _SHRINK = 2  # matching at half size takes a fifth of the time and is accurate enough for fog
 _BLOCK = 5

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Image
 from vslam.datasets.perturbation.kinds import (
     EachSide,
     Law,
@@ -15,6 +14,7 @@ from vslam.datasets.perturbation.kinds import (
     Scene,
     to_8_bits,
 )
+from vslam.types.camera import Image
 
 _DIRT_GREY, _DIRT_SOFTNESS_PX = 45.0, 3.0
 _GHOSTS = 5

@@ -13,9 +13,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, DepthImage, Image
 from vslam.datasets.frames import Source
-from vslam.errors import InputError
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera, DepthImage, Image
 
 RandomStream = tuple[int, int]
 """The user's seed, and a number for the law. All seeds of the law begin with these two numbers."""

@@ -10,11 +10,11 @@ from zlib import crc32
 
 import numpy as np
 
-from vslam.camera import DepthImage, Image, ImageMap
 from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.perturbation.kinds import EachSide, LawKind, Pair, PairLaw, Scene, SceneLaw
 from vslam.datasets.perturbation.registry import LAWS, all_laws
-from vslam.errors import DroppedFrameError, InputError, did_you_mean
+from vslam.support.errors import DroppedFrameError, InputError, did_you_mean
+from vslam.types.camera import DepthImage, Image, ImageMap
 
 
 @dataclass(frozen=True)

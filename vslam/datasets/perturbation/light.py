@@ -15,8 +15,8 @@ from math import exp, floor, inf
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Image
 from vslam.datasets.perturbation.kinds import Law, LawKind, RandomStream, to_8_bits
+from vslam.types.camera import Image
 
 STEP_S = 0.01
 _TIME_CONSTANT_S = 2.0

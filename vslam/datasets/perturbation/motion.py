@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Image
 from vslam.datasets.perturbation.kinds import EachSide, LawKind, PairLaw, RandomStream, Scene
+from vslam.types.camera import Image
 
 _SHRINK = 2
 

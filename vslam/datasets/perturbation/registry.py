@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from vslam.camera import Image
 from vslam.datasets.perturbation import glass, light, motion, sensor, stereo, weather
 from vslam.datasets.perturbation.kinds import Law, LawKind
-from vslam.errors import InputError, UnreadableImageError
-from vslam.plugins import PERTURBATIONS, PlugIn, find_plugins
+from vslam.support.errors import InputError, UnreadableImageError
+from vslam.support.plugins import PERTURBATIONS, PlugIn, find_plugins
+from vslam.types.camera import Image
 
 _PROBE = (48, 64)  # rows and columns of the image on which a new law is tried
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vslam.camera import Image
 from vslam.datasets.perturbation.kinds import Law, LawKind, RandomStream, to_8_bits
-from vslam.errors import DroppedFrameError
+from vslam.support.errors import DroppedFrameError
+from vslam.types.camera import Image
 
 
 def _noise(strength: float, stream: RandomStream) -> Law:

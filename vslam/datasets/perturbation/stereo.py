@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Image
 from vslam.datasets.perturbation.depth import disparity
 from vslam.datasets.perturbation.kinds import (
     LawKind,
@@ -20,6 +19,7 @@ from vslam.datasets.perturbation.kinds import (
     to_8_bits,
 )
 from vslam.datasets.perturbation.motion import neighbours, optical_flow
+from vslam.types.camera import Image
 
 
 def _changing_only_right(change: Callable[[Pair, Image], Image]) -> PairLaw:

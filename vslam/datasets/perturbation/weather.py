@@ -11,7 +11,6 @@ from math import exp, log
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera, Image
 from vslam.datasets.perturbation.depth import dense_depths
 from vslam.datasets.perturbation.kinds import (
     EachSide,
@@ -23,6 +22,7 @@ from vslam.datasets.perturbation.kinds import (
     to_8_bits,
 )
 from vslam.datasets.perturbation.motion import forward_speed
+from vslam.types.camera import Camera, Image
 
 AIRLIGHT = 200.0  # grey value of the horizon in dense fog
 _CONTRAST_AT_VISIBILITY = 0.05  # meteorological optical range, WMO Guide No. 8, I.9

@@ -18,7 +18,7 @@ from vslam.datasets.synthetic.routes import (
 )
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame, cache_folder, render_sequence
-from vslam.errors import InputError
+from vslam.support.errors import InputError
 
 __all__ = [
     "DRIVES",

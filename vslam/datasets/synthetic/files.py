@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
-from vslam.lock_file import locked
+from vslam.support.errors import InputError
+from vslam.support.lock_file import locked
 
 _IMAGE_BYTES, _DEPTH_BYTES = 450_000, 330_000  # generous estimates of the size of one file
 _RESERVE = 200_000_000  # bytes that must stay free

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from vslam.calibration.models import Array, CameraModel, unproject
-from vslam.camera import Camera
 from vslam.datasets.image_files import read_grey
 from vslam.datasets.synthetic.files import frame_files, write, write_png, writing
 from vslam.datasets.synthetic.routes import RATE, Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame, render_sequence
+from vslam.types.camera import Camera
 
 # For each camera: the ratio of its focal length to that of the pinhole camera, the offset of the
 # principal point from the image centre (px), the distortion coefficients k1 to k4, and the rotation

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from vslam.datasets.synthetic.scene import AtlasBuilder, Surfaces, join, patches
 from vslam.datasets.synthetic.terrain import Roads, Terrain
 from vslam.datasets.synthetic.textures import Rng, detail, noise
-from vslam.kernels import kernel
-from vslam.machine import available_cores
+from vslam.support.kernels import kernel
+from vslam.support.machine import available_cores
 
 TILE = 12.8  # m
 _FINE, _COARSE = 512, 64  # texels along the side of a tile with a road, and of one without a road

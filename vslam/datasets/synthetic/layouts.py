@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from vslam.camera import Camera
 from vslam.datasets.frames import Source
 from vslam.datasets.synthetic.files import frame_files, write, writing
 from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import DEPTH_SCALE, OnFrame, render_sequence
 from vslam.datasets.tum import CALIBRATION
-from vslam.errors import InputError
-from vslam.trajectory import Trajectory, write_tum
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera
+from vslam.types.trajectory import Trajectory, write_tum
 
 
 def render_rgbd(

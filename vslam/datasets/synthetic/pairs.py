@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vslam.camera import Camera
 from vslam.datasets.synthetic import solids
 from vslam.datasets.synthetic.files import check_disk, write_png, writing
 from vslam.datasets.synthetic.passes import Passes
@@ -22,6 +21,7 @@ from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.store import OnFrame
 from vslam.datasets.synthetic.town import Town, build_town
+from vslam.types.camera import Camera
 
 _HEIGHT = 0.25  # m, largest change of the camera's height
 _EXPOSURE = 0.25  # standard deviation of the logarithm of the ratio of the two exposures

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.kernels import borrowed, inline, kernel
+from vslam.support.kernels import borrowed, inline, kernel
 
 NEAR = 0.2  # m
 FAR = 400.0  # m

@@ -22,7 +22,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.datasets.synthetic.rasterise import find_visible, rasterise
 from vslam.datasets.synthetic.scene import (
     Atlas,
@@ -33,6 +32,7 @@ from vslam.datasets.synthetic.scene import (
 )
 from vslam.datasets.synthetic.shade import shade
 from vslam.datasets.synthetic.shadows import NO_LAMPS, LampPools, ShadowMap
+from vslam.types.camera import Camera
 
 SAMPLES = 2  # visibility samples per pixel in each direction
 _BANDS = 2  # bands of rows per image; each band is rendered by one thread

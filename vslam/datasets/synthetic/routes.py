@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.datasets.synthetic.terrain import Roads, Terrain, roads_of
-from vslam.errors import InputError, did_you_mean
+from vslam.support.errors import InputError, did_you_mean
+from vslam.types.camera import Camera
 
 Float = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from vslam.datasets.synthetic.rasterise import (
 )
 from vslam.datasets.synthetic.scene import Atlas, PosedCamera
 from vslam.datasets.synthetic.shadows import LampPools, ShadowMap
-from vslam.kernels import borrowed, inline, kernel
+from vslam.support.kernels import borrowed, inline, kernel
 
 _SCALE = 0.5 ** np.arange(24)  # scale of each mipmap level
 _TWO_TAPS = 1.25  # a pixel is sampled twice if the aspect ratio of its footprint is above this

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.synthetic.scene import Atlas, Surfaces
-from vslam.kernels import kernel
+from vslam.support.kernels import kernel
 
 _MAX_CELLS = 30e6
 _FINEST = 0.08  # m

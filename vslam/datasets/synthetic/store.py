@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from vslam.camera import Camera
 from vslam.datasets.synthetic.files import (
     check_disk,
     checksum,
@@ -36,8 +35,9 @@ from vslam.datasets.synthetic.render import Renderer, sensor_image
 from vslam.datasets.synthetic.routes import Route
 from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.synthetic.town import build_town
-from vslam.errors import counted
-from vslam.trajectory import write_kitti
+from vslam.support.errors import counted
+from vslam.types.camera import Camera
+from vslam.types.trajectory import write_kitti
 
 VERSION = 2  # must be increased whenever the same seed produces different images
 DEPTH_SCALE = 100.0  # 16-bit depth images are in centimetres

@@ -12,9 +12,9 @@ from collections.abc import Collection, Generator
 from contextlib import suppress
 from pathlib import Path
 
-from vslam.errors import InputError
 from vslam.lab.bench.execute import CellOutcome, Failed, RunOptions, publish, run_cell
 from vslam.lab.bench.grid import Cell
+from vslam.support.errors import InputError
 
 _CONNECT_S = 10
 _POLL_S = 2.0  # time between checks of the stop event; each check is a request to the scheduler

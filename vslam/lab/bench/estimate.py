@@ -7,9 +7,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from vslam.errors import InputError, counted
 from vslam.lab.bench.grid import Cell
 from vslam.report.schema import ReportJson
+from vslam.support.errors import InputError, counted
 
 # Seconds per frame, and seconds to start a run. They are used until a cell is finished. They were
 # measured on KITTI with loop closing, with two threads of a Xeon.

@@ -22,8 +22,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vslam.errors import InputError, ResultsError
 from vslam.lab.bench.grid import Cell, is_finished, tracked_nothing
+from vslam.support.errors import InputError, ResultsError
 
 _POLL_S = 0.1
 _NOT_KEPT = {"map.npz"}  # hundreds of MB for a long sequence; the report does not need it

@@ -13,8 +13,8 @@ from pathlib import Path
 from vslam.config import changed_thresholds
 from vslam.datasets.perturbation import law_kind, parse_perturbation
 from vslam.datasets.sources import SOURCES
-from vslam.errors import InputError
 from vslam.report.schema import ReportJson
+from vslam.support.errors import InputError
 
 
 @dataclass(frozen=True, order=True)

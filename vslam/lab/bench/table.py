@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from vslam.errors import counted
 from vslam.lab.bench.estimate import duration, estimate
 from vslam.lab.bench.execute import CellOutcome, Failed
 from vslam.lab.bench.grid import Cell, read_report
 from vslam.report.schema import ReportJson
+from vslam.support.errors import counted
 
 
 class GridProgress:

@@ -36,7 +36,7 @@ def _median_ms(call: Callable[[], object]) -> float:
 
 
 def _bow(file: Path | None) -> Cost:
-    from vslam.machine import peak_memory_mb
+    from vslam.support.machine import peak_memory_mb
 
     began = time.process_time()
     from vslam.loopclosure.bow_index import InvertedIndex
@@ -65,7 +65,7 @@ def _bow(file: Path | None) -> Cost:
 
 
 def _network(name: str, weights: Path | None) -> Cost:
-    from vslam.machine import peak_memory_mb
+    from vslam.support.machine import peak_memory_mb
 
     began = time.process_time()
     from vslam.lab.loopbench.detectors import NetworkScorer

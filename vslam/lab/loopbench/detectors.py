@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import OrbConfig, SiameseConfig
-from vslam.errors import InputError, did_you_mean
 from vslam.frontend.orb import extract
 from vslam.lab.loopbench.conditions import Image
 from vslam.lab.loopbench.node_matching import NodeIndex, index_nodes
@@ -24,6 +23,7 @@ from vslam.loopclosure.registry import DETECTORS, require_detector
 from vslam.loopclosure.siamese.images import to_size
 from vslam.loopclosure.siamese.inference import open_network
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector
+from vslam.support.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from vslam.loopclosure.siamese.local_descriptors import LocalDescriptors

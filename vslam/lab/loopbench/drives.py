@@ -10,12 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vslam.errors import InputError
 from vslam.lab.loopbench.sets import ProgressBar, rendered_route
 from vslam.loopclosure.siamese.image_source import ImageSource
 from vslam.loopclosure.siamese.kitti_source import read_kitti
 from vslam.loopclosure.siamese.source_registry import open_source, split_spec
-from vslam.trajectory import write_kitti
+from vslam.support.errors import InputError
+from vslam.types.trajectory import write_kitti
 
 if TYPE_CHECKING:
     from vslam.datasets.synthetic import Route, Variation

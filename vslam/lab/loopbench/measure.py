@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import LearnedMatchingConfig, VerificationConfig
-from vslam.geometry import Matrix
 from vslam.lab.loopbench.conditions import Condition
 from vslam.lab.loopbench.detectors import (
     DescribedImage,
@@ -33,6 +32,7 @@ from vslam.loopclosure.precision_recall import (
     top_k_precision_recall,
 )
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
+from vslam.types.geometry import Matrix
 
 # Verification by learned descriptors: the least number of confirmed cells (`confirmed_cells`), and
 # the least cosine similarity of a coarse match that is counted.

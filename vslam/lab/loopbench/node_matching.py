@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.kernels import hamming, kernel
+from vslam.support.kernels import hamming, kernel
 
 
 class NodeIndex(NamedTuple):

@@ -26,9 +26,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError
 from vslam.loopclosure.precision_recall import PrecisionRecall, curve_of
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME
+from vslam.support.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from vslam.errors import counted
 from vslam.lab.loopbench.curves import draw_curves
 from vslam.lab.loopbench.measure import LENGTH, MIN_CONFIRMED, MIN_MATCHES, TOP
 from vslam.lab.loopbench.schema import LoopsJson, OnlineScore, Score
 from vslam.report.page import Bullets, Page, Pairs, Section, Table
 from vslam.report.render import html, markdown, write_files
+from vslam.support.errors import counted
 
 _Scored = TypeVar("_Scored", bound=Score | OnlineScore)
 

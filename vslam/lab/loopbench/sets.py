@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.errors import InputError, counted
 from vslam.lab.loopbench.conditions import Condition, Image, apply
 from vslam.loopclosure.siamese.image_source import UNKNOWN, ImageSource
 from vslam.loopclosure.siamese.source_registry import open_source, split_spec
+from vslam.support.errors import InputError, counted
 
 ProgressBar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 """A function of ``(text, number of steps)`` that returns a context manager with a progress bar.

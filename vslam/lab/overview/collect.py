@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from vslam.config import changed_thresholds, with_preset
-from vslam.errors import InputError, counted
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.lab.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
 from vslam.report.schema import DetectorFigures, ReportJson
 from vslam.run.outcome import alignment_of
-from vslam.trajectory import Trajectory, read_trajectory
-from vslam.untrusted import require_utf8
+from vslam.support.errors import InputError, counted
+from vslam.support.untrusted import require_utf8
+from vslam.types.trajectory import Trajectory, read_trajectory
 
 MONOCULAR = ", mono"  # suffix of the name of a monocular system
 # Options of a run that change its results but are not part of its `Drive`.

@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from vslam.errors import InputError
 from vslam.lab.overview.collect import Found, read_aligned, without_settings
 from vslam.lab.overview.schema import Drive, OverviewJson, Row, RunEntry
 from vslam.lab.overview.summary import strengths, systems
@@ -33,6 +32,7 @@ from vslam.report.drawing import (
     new_figure,
     plain_ticks,
 )
+from vslam.support.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from vslam.errors import counted
 from vslam.lab.overview.collect import collect
 from vslam.lab.overview.figures import draw_overview
 from vslam.lab.overview.schema import DECIMALS, MEASURES, Measure, OverviewJson, RunEntry, Spread
@@ -13,6 +12,7 @@ from vslam.lab.overview.summary import ALPHA, summarize
 from vslam.lab.overview.versus import median_text, versus
 from vslam.report.page import Bullets, Figure, Page, Pairs, Section, Table, number
 from vslam.report.render import csv_text, html, markdown, write_files
+from vslam.support.errors import counted
 
 _MOTION = ("rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m")
 _OTHER = ("loops_found", "loops_missed", "loops_wrong", "fps")

@@ -20,12 +20,12 @@ from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 from vslam.config import thresholds_in_words
-from vslam.errors import InputError
 from vslam.lab.overview.collect import run_folders
 from vslam.report.page import number
 from vslam.report.render import fill_template
 from vslam.report.schema import ReportJson
-from vslam.untrusted import require_utf8
+from vslam.support.errors import InputError
+from vslam.support.untrusted import require_utf8
 
 HOST = "127.0.0.1"
 _HOST_NAMES = (HOST, "localhost")

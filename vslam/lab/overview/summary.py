@@ -14,7 +14,6 @@ from datetime import UTC, datetime
 from itertools import combinations
 from typing import NamedTuple
 
-from vslam.errors import InputError, counted, did_you_mean
 from vslam.lab.overview.collect import MONOCULAR, Found, without_settings
 from vslam.lab.overview.schema import (
     ALL,
@@ -28,7 +27,8 @@ from vslam.lab.overview.schema import (
     Spread,
 )
 from vslam.loopclosure.siamese.weights import NETWORKS
-from vslam.machine import versions
+from vslam.support.errors import InputError, counted, did_you_mean
+from vslam.support.machine import versions
 
 ALPHA = 0.05
 _KNOWN = ("none", "bow", *NETWORKS, "both")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from vslam.errors import counted
 from vslam.evaluation.loops import MIN_LENGTH_M
 from vslam.lab.overview.collect import without_settings
 from vslam.lab.overview.schema import Comparison, Drive, OverviewJson, Row, Spread
 from vslam.lab.overview.summary import ALPHA, COMPARED, ROTATION, least_pairs
 from vslam.report.page import Bullets, Section, Table
+from vslam.support.errors import counted
 
 _TEXTS = ("sequence", "perturbation")
 _SHOWN = {**COMPARED, **ROTATION}

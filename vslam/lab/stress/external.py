@@ -32,17 +32,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.camera import Camera
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.synthetic.store import calibration_text
-from vslam.errors import DroppedFrameError, InputError, ResultsError, UnreadableImageError
-from vslam.features import TrackingState, TrackResult
 from vslam.report.folder import write_results
 from vslam.report.schema import ReportJson
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
-from vslam.trajectory import Trajectory, bridge_gaps, read_trajectory
+from vslam.support.errors import DroppedFrameError, InputError, ResultsError, UnreadableImageError
+from vslam.types.camera import Camera
+from vslam.types.features import TrackingState, TrackResult
+from vslam.types.trajectory import Trajectory, bridge_gaps, read_trajectory
 
 _SAME_TIME_S = 1e-3
 

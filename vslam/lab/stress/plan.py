@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from vslam.datasets.perturbation import all_laws, law_kind, parse_perturbation
-from vslam.errors import InputError, did_you_mean
 from vslam.lab.bench.grid import Cell, draws
 from vslam.lab.stress.criterion import Criterion
 from vslam.lab.stress.kitti_c import CORRUPTIONS
 from vslam.lab.stress.search import Boundary, boundary, next_position, strength_at
 from vslam.report.schema import ReportJson
+from vslam.support.errors import InputError, did_you_mean
 
 Reports = Callable[[Cell], ReportJson | str | None]
 """A function that returns the report of a cell, or the reason why the cell failed.

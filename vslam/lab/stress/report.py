@@ -14,13 +14,13 @@ import numpy as np
 
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import law_kind, sheet_of_laws
-from vslam.errors import InputError, counted
 from vslam.lab.stress.criterion import ABSOLUTE
 from vslam.lab.stress.figures import draw_curves
 from vslam.lab.stress.schema import BoundaryEntry, StressJson
 from vslam.lab.stress.summary import mean_error
 from vslam.report.page import Bullets, Figure, Page, Row, Section, Table, number
 from vslam.report.render import csv_text, html, markdown, write_files
+from vslam.support.errors import InputError, counted
 
 _ABOUT = (
     "The weakest strength at which a run fails, as found by bisection. The table gives the median "

@@ -1,0 +1,1 @@
+"""What happens to a frame: tracking, mapping, the search for loops and their correction."""

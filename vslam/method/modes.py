@@ -1,0 +1,222 @@
+"""The two modes of SLAM: building a map, and localising in a map without changing it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from vslam.frontend.keyframes import KeyframeEvidence, KeyframePolicy
+from vslam.frontend.track import By, Images, Prediction, Track
+from vslam.frontend.tracker import Tracker
+from vslam.method.mapping import Mapper
+from vslam.method.starter import Starter
+from vslam.types.camera import Image
+from vslam.types.context import Context
+from vslam.types.geometry import inverse, orthonormalised, se3_log
+from vslam.types.states import PolicyState
+
+# A standing camera is still at its reference keyframe if it has moved by less than this many
+# baselines, and if its rotation moves the image by less than this many pixels.
+STANDS_M, STANDS_PX = 0.1, 3.0
+PATIENCE_S = 5.0  # s before a sub-map begins if a standing camera is lost
+
+
+class Mode(Protocol):
+    """Decides how frames change the map.
+
+    Attributes:
+        changes_map: whether a drive in this mode changes the map.
+        due: index of the frame that is planned to become a keyframe, or -1.
+    """
+
+    @property
+    def changes_map(self) -> bool: ...
+    @property
+    def due(self) -> int: ...
+
+    def begin(self, track: Track, image: Image | None) -> Track:
+        """Try to begin a map or sub-map with a recorded frame that was not tracked.
+
+        Returns:
+            The frame. It is a keyframe if it has begun a map.
+        """
+        ...
+
+    def map_far_points(self, last: Track | None) -> Track | None:
+        """Map the far stereo points of the last frame if this frame began a map or sub-map.
+
+        Call this method if the new frame cannot be tracked.
+
+        Returns:
+            The last frame with the added points, so that tracking can be tried again. None if no
+            points were added.
+        """
+        ...
+
+    def update_map(self, track: Track, images: Images, predicted: Prediction) -> Track:
+        """Change the map after a frame was recorded.
+
+        Returns:
+            The frame in the changed map. It may have become a keyframe.
+        """
+        ...
+
+    def state(self) -> PolicyState | None:
+        """Return the state for a checkpoint, or None if no checkpoint is possible now."""
+        ...
+
+    def restore(self, state: PolicyState) -> None:
+        """Restore a state that the method ``state`` returned."""
+        ...
+
+
+class Localising:
+    """Localises in the map and never changes it (``Mode``)."""
+
+    changes_map = False
+    due = -1
+
+    def __init__(self, mapper: Mapper) -> None:
+        self._mapper = mapper
+
+    def begin(self, track: Track, image: Image | None) -> Track:
+        return track
+
+    def map_far_points(self, last: Track | None) -> Track | None:
+        return None
+
+    def update_map(self, track: Track, images: Images, predicted: Prediction) -> Track:
+        if not track.is_lost:
+            self._mapper.refer_to_nearest(track)
+        return track
+
+    def state(self) -> PolicyState | None:
+        return None
+
+    def restore(self, state: PolicyState) -> None:
+        pass
+
+
+class Building:
+    """Builds a map (``Mode``). Frames that see something new are inserted as keyframes.
+
+    Attributes:
+        starter: finds the frames with which a monocular map or sub-map begins.
+        policy: decides which frames become keyframes.
+    """
+
+    changes_map = True
+
+    def __init__(self, context: Context, mapper: Mapper, tracker: Tracker) -> None:
+        self.starter = Starter(context)
+        self.policy = KeyframePolicy(context)
+        self._context = context
+        self._camera = context.camera
+        self._config = context.config
+        self._mapper = mapper
+        self._tracker = tracker
+
+    @property
+    def due(self) -> int:
+        return self.policy.due
+
+    def begin(self, track: Track, image: Image | None) -> Track:
+        if self._camera.monocular:
+            return self._begin_with_two_views(track, image)
+        if track.n_stereo < self._config.tracking.min_stereo_start:
+            return track
+        predicted, fresh = track.twist is not None, replace(track.without(), twist=None)
+        track = self._mapper.insert(fresh, image, predicted=predicted)
+        self.policy.reference_renewed()
+        return track
+
+    def _begin_with_two_views(self, track: Track, image: Image | None) -> Track:
+        start = self.starter.offer(track, image)
+        if start is None:
+            return track
+        (moved,) = self._mapper.settle(track)
+        start = start.at_speed(moved.twist, self._config.initialization.max_rescaling)
+        track = self._mapper.begin(start)
+        self.starter.reset()
+        return track
+
+    def map_far_points(self, last: Track | None) -> Track | None:
+        if last is None or last.twist is not None or self._camera.monocular:
+            return None
+        return self._mapper.map_far_points(last)
+
+    def update_map(self, track: Track, images: Images, predicted: Prediction) -> Track:
+        if track.is_lost:
+            lost = self._is_lost_for_long(track, predicted)
+            return self.begin(track, images.image) if lost else track
+        self.starter.reset()
+        self._mapper.count(track)
+        evidence = self.policy.observe(
+            track,
+            self._mapper.view,
+            seconds_since_keyframe=track.timestamp - self._mapper.last_timestamp,
+            mapping_idle=self._mapper.is_published,
+        )
+        if track.by is By.STANDSTILL or self._stays_at_reference(track):
+            return track  # only a moving object could show something new
+        if not self._is_keyframe(track, evidence):
+            return track
+        (track,) = self._mapper.settle(track)
+        seen: Track | None = track
+        if track.by_patches:
+            seen = self._tracker.match_features(track, images, self._mapper.view)
+        if seen is None or self._use_existing_keyframe(seen):
+            return seen or track
+        self.policy.reference_renewed()
+        return self._mapper.insert(seen, images.image)
+
+    def _is_lost_for_long(self, track: Track, predicted: Prediction) -> bool:
+        """Return whether a lost frame may begin a sub-map."""
+        config, last = self._config.tracking, predicted.last
+        young = self._mapper.n_keyframes <= config.young_keyframes
+        patience = 1 if young else config.lost_frames_before_restart
+        if self._camera.monocular:
+            patience = config.monocular_lost_frames
+        stood = last is not None and predicted.standstill(self._mapper.view) is not None
+        if last is not None and stood and track.timestamp - last.timestamp < PATIENCE_S:
+            return False  # something may be standing or passing in front of the camera
+        return predicted.lost_frames + 1 >= patience
+
+    def _stays_at_reference(self, track: Track) -> bool:
+        """Return whether the camera has come to rest at its reference keyframe."""
+        if track.still is None:
+            return False
+        moved = se3_log(orthonormalised(track.T_cw @ inverse(self._mapper.view.T_reference)))
+        camera = self._camera
+        return bool(
+            np.linalg.norm(moved[:3]) < STANDS_M * camera.baseline
+            and np.linalg.norm(moved[3:]) * camera.fx < STANDS_PX
+        )
+
+    def _is_keyframe(self, track: Track, evidence: KeyframeEvidence) -> bool:
+        if track.by_patches:
+            return self.policy.is_due(track.index, evidence)
+        return self.policy.wants_keyframe(evidence)
+
+    def _use_existing_keyframe(self, track: Track) -> bool:
+        """If the place is known, make an existing keyframe the reference keyframe.
+
+        Returns:
+            Whether the place is known.
+        """
+        place, n_inliers = self._mapper.find_old_place(track), len(track.tracked)
+        if place is None or not self.policy.is_known(
+            n_inliers=n_inliers, n_shared=place.n_shared, n_place=place.n_place
+        ):
+            return False
+        self._mapper.use_existing_keyframe(place, track)
+        self.policy.reference_renewed()
+        return True
+
+    def state(self) -> PolicyState | None:
+        return None if self.starter.is_waiting else self.policy.state
+
+    def restore(self, state: PolicyState) -> None:
+        self.policy = KeyframePolicy(self._context, state)

@@ -1,0 +1,275 @@
+"""The map, and what tracking sees of it.
+
+A job in another thread maps each keyframe. Its result is *published*: it becomes visible to
+tracking. This happens at a fixed frame index, regardless of how long the job takes. In between,
+tracking reads a ``MapView``, which is a copy of parts of the map. Frames that tracking holds move
+with the map: a method that publishes takes them, and returns them as they are in the changed map.
+
+After publishing, the other thread searches for a loop at the keyframe. If a loop is found, it is
+closed before the map is changed again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from vslam.backend.disparity_offset import offset_sigma
+from vslam.frontend.patches import RecentPatches, patches_of_landmarks
+from vslam.frontend.track import Track
+from vslam.method.closing import LoopClosing, LoopSearch
+from vslam.method.hypotheses import part_of
+from vslam.method.map_frames import LandmarkCounts, MapChange
+from vslam.method.shared_map import SharedMap
+from vslam.support.workers import Job, Workers
+from vslam.types.context import Context
+from vslam.types.features import FramePatches
+from vslam.types.frame_poses import FramePoses, FrameTable
+from vslam.types.geometry import Matrix, inverse
+from vslam.types.map import Map
+from vslam.types.map_view import MapView, local_map, view_of
+from vslam.types.states import MapperState
+from vslam.types.trajectory import Trajectory
+
+# A loop that was found is closed this many frames after its keyframe, or at the next keyframe.
+_CLOSE_AFTER_FRAMES = 10
+
+
+class PublishedMap:
+    """A map that jobs change, and the view of it that tracking reads.
+
+    Attributes:
+        view: the copy of parts of the map that tracking reads.
+        frames: the pose of every frame, relative to a keyframe.
+        last_frame, last_timestamp: index and time (seconds) of the frame that became the last
+            keyframe.
+        is_published: whether tracking sees the results of all mapping jobs.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        closing: LoopClosing,
+        workers: Workers,
+        map_: Map | None = None,
+        frames: FrameTable | None = None,
+    ) -> None:
+        """Begin a new map, or continue a map.
+
+        Args:
+            workers: threads that run mapping jobs, one at a time, and searches for loops.
+            map_: map to continue in. None begins an empty map.
+            frames: poses of earlier frames of the same drive.
+        """
+        self.view = MapView(T_reference=inverse(context.camera.T_mounted_camera))
+        self.last_frame = -1
+        self.last_timestamp = -np.inf
+        self.is_published = True
+        self._shared = SharedMap(map_ or Map(context.scales), workers)
+        self._context = context
+        self._closing = closing
+        self._patches = RecentPatches(context.config.alignment.keyframes)
+        self._known_place: FramePatches | None = None
+        self._next_search: Callable[[Map], LoopSearch] | None = None  # starts after publishing
+        self._search: Job[LoopSearch] | None = None
+        self._counts = LandmarkCounts()
+        self.frames = FramePoses(self, frames)
+        if self.map.n_keyframes:
+            self.refer_to(int(self.map.living_keyframes()[-1]))
+
+    # What may be read at any time
+
+    @property
+    def n_keyframes(self) -> int:
+        """Number of keyframes so far, including culled keyframes."""
+        return self.view.n_keyframes
+
+    @property
+    def reference(self) -> int:
+        """The keyframe that the poses of new frames are relative to."""
+        return self.view.reference
+
+    @property
+    def has_found_loop(self) -> bool:
+        """Wait for the search for loops. Return whether it found a loop that is not closed yet."""
+        return self._search is not None and self._search.result().loop is not None
+
+    @property
+    def is_mapping(self) -> bool:
+        """Whether a keyframe is being mapped, so that another thread may be writing the map."""
+        return self._shared.is_busy
+
+    @property
+    def map(self) -> Map:
+        """The map. Raises a RuntimeError if a keyframe is being mapped, or its mapping failed."""
+        return self._shared.map
+
+    def keyframe_pose(self, keyframe: int) -> Matrix:
+        """Return the pose ``T_cw`` of a keyframe.
+
+        While a mapping job runs, only the pose of the reference keyframe is available.
+        """
+        if not self.is_published and keyframe == self.view.reference:
+            return self.view.T_reference
+        return self.map.keyframe_pose(keyframe)
+
+    def unit_scale(self, keyframe: int) -> float:
+        """Return the factor by which loop closures have scaled lengths near a keyframe.
+
+        While a mapping job runs, only the factor of the reference keyframe is available.
+        """
+        if not self.is_published and keyframe == self.view.reference:
+            return self.view.unit_scale
+        return float(self.map.unit_scale[keyframe])
+
+    def trajectory(self) -> Trajectory:
+        """Return the pose of every frame (``FramePoses.trajectory``)."""
+        self.map  # noqa: B018 (raises if it cannot be read)
+        return self.frames.trajectory()
+
+    # The schedule
+
+    def publish(self, *tracks: Track, frame: int | None = None) -> tuple[Track, ...]:
+        """Make the result of the mapping job visible to tracking, and return the moved tracks.
+
+        Args:
+            frame: index of the next frame. Only what is due at this frame is published: the result
+                of the mapping job ``merge_after_frames`` frames after the last keyframe, and a loop
+                that was found there after ten frames. If it is None, the method waits for the
+                mapping job and for the search for loops, but closes no loop.
+        """
+        if frame is None:
+            tracks = self._publish(tracks)
+            self.wait()
+            return tracks
+        age = frame - self.last_frame
+        if age >= self._context.config.keyframes.merge_after_frames:
+            tracks = self._publish(tracks)
+        return self.settle(*tracks) if age >= _CLOSE_AFTER_FRAMES else tracks
+
+    def settle(self, *tracks: Track) -> tuple[Track, ...]:
+        """Publish the result of the mapping job, close the loop if one was found, and return the
+        moved tracks. Every change of the map begins with this."""
+        tracks = self.publish(*tracks)
+        if self._search is None:
+            return tracks
+        search, self._search = self._search.result(), None
+        with self._shared.change() as map_:
+            self._closing.close(map_, search)
+        return self._renew_view(tracks)
+
+    def wait(self) -> Map:
+        """Wait for the mapping job and for the search for loops, and return the map.
+
+        Nothing is published. Therefore, this method does not change the trajectory.
+        """
+        map_ = self._wait_for_mapping()
+        self._start_search()
+        if self._search is not None and (search := self._search.result()).loop is None:
+            self._closing.close(map_, search)
+            self._search = None
+        return map_
+
+    def finish(self, *tracks: Track) -> tuple[Track, ...]:
+        """Complete all running work, including a global bundle adjustment. Return the moved
+        tracks."""
+        tracks = self.settle(*tracks)
+        with self._shared.change() as map_:
+            self._closing.conclude(map_)
+            self._closing.finish(map_)
+        return self._renew_view(tracks) if self.n_keyframes else tracks
+
+    def _wait_for_mapping(self) -> Map:
+        map_ = self._shared.wait()
+        self._counts.write(map_)
+        return map_
+
+    def _start_search(self) -> None:
+        if self._next_search is not None:
+            self._search = self._shared.start_reading(self._next_search)
+            self._next_search = None
+
+    def _publish(self, tracks: tuple[Track, ...]) -> tuple[Track, ...]:
+        if self.is_published:
+            return tracks
+        self._wait_for_mapping()
+        self.is_published = True
+        tracks = self._renew_view(tracks)
+        self._start_search()
+        return tracks
+
+    def _renew_view(self, tracks: tuple[Track, ...]) -> tuple[Track, ...]:
+        before = self.view
+        self.refer_to(before.reference)
+        change = MapChange(before, self.view, self.map, self.frames)
+        return tuple(change.applied_to(track) for track in tracks)
+
+    # Frames
+
+    def record(self, track: Track) -> None:
+        """Record the pose of the next frame. Only a recorded frame can become a keyframe.
+
+        If the frame was relocalised, the keyframe near it becomes the reference keyframe.
+        """
+        if track.near >= 0:
+            self.refer_to(track.near)
+        self.frames.append(track.timestamp, track.T_cw, tracked=not track.is_lost)
+
+    def count(self, track: Track) -> None:
+        """Count the landmarks that a frame should have seen, and those that it found."""
+        self._counts.add(track.visible, track.tracked)
+
+    # The reference keyframe, which is not part of the map
+
+    def refer_to(self, keyframe: int) -> None:
+        """Make a keyframe the reference keyframe, so that tracking sees the landmarks around it."""
+        map_, config = self.map, self._context.config
+        local = local_map(map_, keyframe, config.tracking.local_keyframes)
+        if (place := self._known_place) is None:
+            patches = self._patches.of(map_, local.ids)
+        else:
+            T_cw = self.frames.pose(place.frame)
+            patches = patches_of_landmarks(place, local.ids, T_cw, map_.scales)
+        monocular = self._context.camera.monocular
+        self.view = replace(
+            view_of(map_, keyframe, local, patches, monocular=monocular),
+            part=part_of(map_, self._closing.closed, keyframe),
+            offset_sigma=offset_sigma(map_.scalars.offset_information, config.stereo),
+        )
+
+    # State for checkpoints
+
+    def state(self) -> MapperState:
+        """Return the state of the mapper for a checkpoint, without the map."""
+        return MapperState(
+            self.reference,
+            self.last_frame,
+            self.last_timestamp,
+            self._patches.all(),
+            self._known_place,
+        )
+
+    def restore(self, state: MapperState) -> None:
+        """Restore a state, given the map that was saved together with it."""
+        self.last_frame, self.last_timestamp = state.last_frame, state.last_timestamp
+        for patches in state.patches:
+            self._patches.add(patches)
+        self._known_place = state.known_place
+        self.refer_to(state.reference)
+
+    def continue_drive(self) -> None:
+        """If the reference keyframe belongs to this drive, treat it as the last inserted one."""
+        map_, newest = self.map, self.reference
+        if map_.n_keyframes and map_.sessions[newest] == map_.scalars.session:
+            self.last_frame = int(map_.frames[newest])
+            self.last_timestamp = float(map_.timestamps[newest])
+
+    def _start(
+        self, job: Callable[[Map], None], search: Callable[[Map], LoopSearch] | None = None
+    ) -> None:
+        """Start a job that changes the map, and then a search for a loop."""
+        self._shared.start(job)
+        self._next_search = search
+        self.is_published = False

@@ -1,0 +1,142 @@
+"""The start of a map, and the start of a sub-map after the camera was lost.
+
+A stereo or RGB-D map begins with one frame that has enough points. A monocular map needs two
+frames. The first frame is kept until a later frame forms a pair with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.backend.two_views import adjust_two_views
+from vslam.frontend.initialization import match_views, reconstruct
+from vslam.frontend.track import Track
+from vslam.types.camera import Image
+from vslam.types.context import Context
+from vslam.types.geometry import Matrix, se3_log
+
+
+@dataclass(frozen=True)
+class TwoViewStart:
+    """The start of a monocular map or sub-map from two frames.
+
+    Attributes:
+        first, second: the two frames. The map begins at the pose of the first frame.
+        images: their ``(H, W)`` uint8 images for loop detectors. None if they are not available.
+        T_2_1: ``(4, 4)``, maps points from the camera of the first frame to the camera of the
+            second frame.
+        features: two ``(N,)`` int64 arrays with the indices of the matched features in the first
+            frame and in the second frame.
+        points: ``(N, 3)`` points that were triangulated from these features, in the frame of the
+            first camera.
+        predicted: whether the unit of the map was derived from the speed that the camera had before
+            it was lost.
+    """
+
+    first: Track
+    second: Track
+    images: tuple[Image | None, Image | None]
+    T_2_1: Matrix
+    features: tuple[NDArray[np.int64], NDArray[np.int64]]
+    points: Matrix
+    predicted: bool = False
+
+    @property
+    def twist(self) -> Matrix:
+        """``(6,)`` twist per second from the first frame to the second frame."""
+        return se3_log(self.T_2_1) / (self.second.timestamp - self.first.timestamp)
+
+    def at_speed(self, twist: Matrix | None, max_rescaling: float) -> TwoViewStart:
+        """Scale the start of a sub-map to the speed that the camera had before it was lost.
+
+        The unit of the sub-map is then approximately the unit of the map before the loss.
+
+        Args:
+            twist: ``(6,)`` twist per second before the camera was lost. None if it is unknown.
+            max_rescaling: nothing is scaled if the factor is larger than this number or smaller
+                than its inverse.
+        """
+        if twist is None:
+            return self
+        moved = np.linalg.norm(twist[:3]) * (self.second.timestamp - self.first.timestamp)
+        factor = float(moved / np.linalg.norm(self.T_2_1[:3, 3]))
+        if not 1.0 / max_rescaling < factor < max_rescaling:
+            return self
+        T_2_1 = self.T_2_1.copy()
+        T_2_1[:3, 3] *= factor
+        return replace(self, T_2_1=T_2_1, points=factor * self.points, predicted=True)
+
+
+class Starter:
+    """Finds the two frames with which a monocular map or sub-map can begin."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._first: tuple[Track, Image | None] | None = None
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether the first frame of a monocular map is waiting for a second frame."""
+        return self._first is not None
+
+    def reset(self) -> None:
+        """Discard the waiting first frame of a monocular map, if there is one."""
+        self._first = None
+
+    def offer(self, track: Track, image: Image | None) -> TwoViewStart | None:
+        """Try to begin a map with a frame that was not tracked and the earlier frame that was kept.
+
+        If the two frames have too few matches or are too far apart in time, the new frame replaces
+        the kept frame.
+
+        Args:
+            image: the ``(H, W)`` uint8 image of the frame. None if it is not available.
+
+        Returns:
+            The two frames with which the map begins, or None if it cannot begin yet.
+        """
+        config, second = self._context.config.initialization, (track, image)
+        if self._first is None or track.timestamp - self._first[0].timestamp > config.max_seconds:
+            self._keep(second)
+            return None
+        features = match_views(self._first[0].features, track.features, self._context)
+        if len(features[0]) < config.min_matches:
+            self._keep(second)
+            return None
+        return self._pair(self._first, second, features)
+
+    def _keep(self, frame: tuple[Track, Image | None]) -> None:
+        enough = len(frame[0].features) >= self._context.config.initialization.min_features
+        self._first = frame if enough else None
+
+    def _pair(
+        self,
+        first: tuple[Track, Image | None],
+        second: tuple[Track, Image | None],
+        features: tuple[NDArray, NDArray],
+    ) -> TwoViewStart | None:
+        config, camera = self._context.config.initialization, self._context.camera
+        of_1, of_2 = first[0].features, second[0].features
+        xy_1, xy_2 = of_1.xy[features[0]].astype(float), of_2.xy[features[1]].astype(float)
+        sigma = self._context.scales[of_1.octave[features[0]]]
+        found = reconstruct(xy_1, xy_2, sigma, camera, config, seed=second[0].index)
+        if found is None:
+            return None
+        match = found.match
+        T_2_1, points, kept = adjust_two_views(
+            found.T_2_1,
+            found.points,
+            np.stack([xy_1[match], xy_2[match]], axis=1),
+            sigma[match],
+            camera,
+            config.median_depth,
+        )
+        if np.count_nonzero(kept) < config.min_landmarks:
+            return None
+        match = match[kept]
+        features = features[0][match], features[1][match]
+        images = first[1], second[1]
+        return TwoViewStart(first[0], second[0], images, T_2_1, features, points[kept])

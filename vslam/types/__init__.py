@@ -1,0 +1,1 @@
+"""Plain typed data that the parts of vslam exchange, and the geometry that it needs."""

@@ -1,0 +1,62 @@
+"""The camera and the thresholds, which nearly every part of SLAM needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.config import Config, OrbConfig
+from vslam.types.camera import Camera
+
+
+def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
+    """Return the ``(levels,)`` sizes of a pixel of each level, in pixels of the image."""
+    return config.scale_factor ** np.arange(config.n_levels, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Context:
+    """The camera, the thresholds, and quantities that are derived from them.
+
+    Attributes:
+        scales: ``(levels,)`` pyramid scale factors.
+    """
+
+    camera: Camera
+    config: Config
+    scales: NDArray[np.float64]
+
+    @classmethod
+    def create(cls, camera: Camera, config: Config) -> Context:
+        return cls(camera, config, scale_factors(config.orb))
+
+    @property
+    def tracks_patches(self) -> bool:
+        """Whether frames are tracked using image patches when possible.
+
+        For RGB-D cameras, patch-based tracking is less accurate and not faster
+        (docs/research/performance.md).
+        """
+        method, camera = self.config.tracking.method, self.camera
+        if method == "auto":
+            return camera.sensor == "stereo"
+        return method == "patches" and not camera.depth
+
+    @property
+    def close_depth(self) -> float:
+        """Depth below which a stereo point is close, in metres (ORB-SLAM2 paper, section III-A)."""
+        return self.config.stereo.close_depth_baselines * self.camera.baseline
+
+    @property
+    def motion_window(self) -> float:
+        """Search radius at octave 0 around points that the previous frame observed, in pixels."""
+        config = self.config.tracking
+        return config.depth_motion_window if self.camera.depth else config.motion_window
+
+    @property
+    def local_window(self) -> float:
+        """Search radius at octave 0 around landmarks of the local map, in pixels."""
+        config = self.config.tracking
+        return config.depth_local_window if self.camera.depth else config.local_window

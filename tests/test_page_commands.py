@@ -126,7 +126,6 @@ RULES = {
             ("vslam run --dataset oakd", DEPTH_CAMERA),
         )
     ),
-    "docs/explanation/design.md": Rules(),
     "docs/howto/exports.md": Rules(
         (
             ("colmap RUN", "colmap RUN --out again"),

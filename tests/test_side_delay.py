@@ -69,7 +69,7 @@ def test_nothing_is_said_of_a_rig_whose_rows_do_not_correspond():
 def test_a_few_frames_are_not_believed():
     several = [points(8e-3, k) for k in range(9)]
     assert fit_delay([*several, np.zeros((0, 5))]) is None
-    assert measure_delay([late_frame(0.0, k) for k in range(49)]) is None
+    assert measure_delay([late_frame(0.0, k) for k in range(49)], 49) is None
 
 
 def test_contradicting_frames_are_doubted():
@@ -110,7 +110,7 @@ def late_frame(delay: float, k: int, damaged: bool = False) -> TimedFrame:
 @pytest.mark.parametrize("delay", [0.0, 6e-3, -10e-3])
 def test_the_delay_of_images_is_measured(delay):
     frames = [late_frame(delay, k, damaged=k == 1) for k in range(60)]
-    found = measure_delay(frames)
+    found = measure_delay(frames, len(frames))
     assert found.seconds == pytest.approx(delay, abs=1e-3)
     assert found.is_wrong(CAMERA, CONFIG) is (delay != 0.0)
 
@@ -120,7 +120,7 @@ def test_images_without_motion_are_not_measured(image):
     if image is None:
         image = render(MIPMAPS, CAMERA, pose(0.0))
     frames = [TimedFrame(STEP_S * k, lambda image_map: (image, image)) for k in range(60)]
-    assert measure_delay(frames) is None
+    assert measure_delay(frames, len(frames)) is None
 
 
 def source(delay: float) -> Source:

@@ -196,7 +196,9 @@ def _examine_stereo(
             [(pair.left, pair.right) for pair in pairs], [pair.matches for pair in pairs]
         ),
     ]
-    delay = measure_delay(sequence.stored) if synchronised.verdict == "good" else None
+    delay = None
+    if synchronised.verdict == "good":
+        delay = measure_delay(sequence.stored, len(sequence.stored))
     if delay is not None:
         findings.insert(1, checks.check_delay(delay, sequence.camera, config.stereo))
     findings += _examine_focal_length(sequence, findings)

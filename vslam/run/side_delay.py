@@ -17,10 +17,12 @@ calibration.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -76,18 +78,23 @@ class SideDelay:
         )
 
 
-def measure_delay(frames: Sequence[TimedFrame]) -> SideDelay | None:
-    """Measure the delay in frames that are spread over a sequence of stereo pairs.
+def measure_delay(frames: Iterable[TimedFrame], n_frames: int) -> SideDelay | None:
+    """Measure the delay in frames that are spread over a sequence of ``n_frames`` stereo pairs.
 
-    The result is None if there are too few frames or matches, or if the camera hardly moves.
+    At most three frames are held at a time. The result is None if there are too few frames or
+    matches, or if the camera hardly moves.
     """
-    n = min(_MOST, len(frames) // _APART)
+    n = min(_MOST, n_frames // _APART)
     if n < _FEWEST:
         return None
+    measured = set(np.linspace(1, n_frames - 2, n).round().astype(int).tolist())
+    around: deque[TimedFrame] = deque(maxlen=3)
     several = []
-    for k in np.linspace(1, len(frames) - 2, n).round().astype(int).tolist():
-        with suppress(UnreadableImageError):
-            several.append(_row_motion(*frames[k - 1 : k + 2]))
+    for k, frame in enumerate(islice(frames, n_frames)):
+        around.append(frame)
+        if k - 1 in measured:
+            with suppress(UnreadableImageError):
+                several.append(_row_motion(*around))
     return fit_delay(several)
 
 

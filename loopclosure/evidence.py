@@ -9,14 +9,14 @@ towns, many of them with repeated houses (``tools/experiments/loops/evidence.py`
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.frontend.matching import count_elsewhere
 from vslam.types.geometry import Matrix, transform
-from vslam.types.loops import LoopEdge, LoopEvidence
+from vslam.types.loops import Descriptors, LoopEdge, LoopEvidence
 
 
 class Weights(NamedTuple):
@@ -31,7 +31,7 @@ class Weights(NamedTuple):
     sigma_rotation: float
 
 
-WEIGHTS: dict[Literal["orb", "learned"], Weights] = {
+WEIGHTS: dict[Descriptors, Weights] = {
     "orb": Weights(-7.32, 0.0, -1.35, -1.56, 1.71, 1.67),
     "learned": Weights(-7.32, -3.14, -3.19, -1.78, 1.73, 1.54),
 }
@@ -73,7 +73,7 @@ def evidence_of(
     )
 
 
-def probability_wrong(evidence: LoopEvidence, matched_by: Literal["orb", "learned"]) -> float:
+def probability_wrong(evidence: LoopEvidence, matched_by: Descriptors) -> float:
     """Compute the probability that a loop is wrong.
 
     Args:

@@ -109,9 +109,8 @@ def verify_learned(
     keyframes = [k for k in place_of(map_, match, query, gates).tolist() if k in images]
     if query not in images or not keyframes:
         return replace(edge, reason="no image is stored")
-    estimate = localise(
-        map_, images.maps(query), keyframes, images, camera, config, seed=query << 32 | match
-    )
+    maps = images.maps(query)
+    estimate = localise(map_, maps, keyframes, images, camera, config, seed=query << 32 | match)
     if isinstance(estimate, str):
         return replace(edge, reason=estimate)
     learned = estimate
@@ -144,8 +143,7 @@ def verify_learned(
     if edge.n_inliers < config.min_inliers:
         return replace(edge, reason=f"only {edge.n_inliers} learned matches fit")
     seen_of_query = _seen_of_query(map_, edge, keyframes[0], images, camera, config)
-    zoom = images.maps(query).scale
-    return weighed(edge, _evidence_of(map_, learned, camera, zoom, seen_of_query))
+    return weighed(edge, _evidence_of(map_, learned, camera, maps.scale, seen_of_query))
 
 
 def recognise(

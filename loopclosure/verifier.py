@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,9 @@ from vslam.loopclosure.learned_verification import (
 from vslam.loopclosure.reach import beyond_reach
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.types.camera import Camera
-from vslam.types.loops import LoopCandidate, LoopEdge
+from vslam.types.loops import Descriptors, LoopCandidate, LoopEdge
 from vslam.types.map import Map
 from vslam.types.states import VerifierState
-
-Descriptors = Literal["orb", "learned"]
 
 
 class Trial(NamedTuple):

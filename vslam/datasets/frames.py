@@ -28,7 +28,7 @@ from vslam.types.camera import Camera, DepthImage, Image, ImageMap
 Images = tuple[Image, Image | DepthImage | None]
 Size = tuple[int, int]
 
-_FIRST_FRAMES = 120  # a few seconds; a stereo pair of 752x480 pixels takes 0.7 MB
+FIRST_FRAMES = 120  # a few seconds; a stereo pair of 752x480 pixels takes 0.7 MB
 
 
 @dataclass(frozen=True)
@@ -292,7 +292,7 @@ def first_frames(source: Source) -> Source:
     frames = []
     problem = "it has no frames"
     try:
-        for frame in islice(source.frames(), _FIRST_FRAMES):
+        for frame in islice(source.frames(), FIRST_FRAMES):
             frames.append(_preloaded(frame))
     except BrokenSourceError as error:
         problem = str(error).rstrip(".")

@@ -16,7 +16,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from vslam.datasets.frames import Source, TimedFrame
+from vslam.datasets.frames import FIRST_FRAMES, Source, TimedFrame
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.run.matching import Described, Matches, describe, match_described
 from vslam.run.options import RunOptions
@@ -45,7 +45,6 @@ _FEATURES = 500
 _FEWEST = 30  # matches
 _MANY = 250  # features; if two such images have no match, they show different scenes
 _LAGS = 4  # frames
-_FROM_STREAM = 120  # frames of a stream, which must be decoded again, that are measured at the end
 _TITLE = 30  # frames at the start that may show the same picture in both images, such as a title
 # Largest mean difference of grey values if the camera is at rest, in images that are scaled to an
 # eighth. It is 0.4 to 0.7 at the start of EuRoC's V1_01, and at least 12 on drives.
@@ -145,7 +144,7 @@ class PairCheck:
             return
         try:
             if n_frames >= FEWEST_FRAMES:
-                n_measured = n_frames if source.seekable else min(n_frames, _FROM_STREAM)
+                n_measured = n_frames if source.seekable else min(n_frames, FIRST_FRAMES)
                 found = measure_delay(perturbed(source.frames(), perturbation), n_measured)
                 self._late = delay_warnings(found, self._camera, self._config)
         except Exception as error:  # a failed check must not end the run

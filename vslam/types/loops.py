@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from vslam.types.geometry import adjoint, inverse
 
+Descriptors = Literal["orb", "learned"]  # the kinds of descriptors that are matched
+
 
 @dataclass(frozen=True)
 class LoopCandidate:
@@ -130,7 +132,7 @@ class LoopEdge:
     landmarks: NDArray[np.int32] | None = None
     covariance: NDArray[np.float64] | None = None
     scale: float = 1.0
-    matched_by: Literal["orb", "learned"] = "orb"
+    matched_by: Descriptors = "orb"
     proposed_by: str = ""
     evidence: LoopEvidence | None = None
     against_odometry: bool = False
@@ -141,7 +143,7 @@ class LoopEdge:
         cls,
         candidate: LoopCandidate,
         reason: str = "",
-        matched_by: Literal["orb", "learned"] = "orb",
+        matched_by: Descriptors = "orb",
     ) -> LoopEdge:
         """Create the edge, without a relative pose, of a candidate that was not accepted.
 

@@ -43,7 +43,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
         "vslam.support.file_kinds",
     ),
     ("vslam.config", "vslam.types.geometry", "vslam.support.ransac", "vslam.types.camera"),
-    ("vslam.types.odometry", "vslam.types.context"),
+    ("vslam.types.odometry", "vslam.types.context", "vslam.types.imu"),
     ("vslam.types.features",),
     (
         "vslam.types.loops",

@@ -1,0 +1,265 @@
+"""Preintegration: what inertial samples tell about the motion between two times.
+
+The rotation, the change of velocity and the displacement between two times depend on the state at
+the first time and on gravity in a known way. What remains is integrated once, in the frame of the
+IMU at the first time (Forster et al., "On-Manifold Preintegration for Real-Time Visual-Inertial
+Odometry", T-RO 2017). With the orientation ``R_w0``, velocity ``v_0`` and position ``p_0`` at the
+first time, gravity ``g`` in the world frame and the duration ``t``:
+
+    R_w1 = R_w0 rotation
+    v_1  = v_0 + g t + R_w0 velocity
+    p_1  = p_0 + v_0 t + g t^2 / 2 + R_w0 position
+
+Samples are values at their times, and linear in between. Each interval between two samples is
+integrated with the mean of both, in the orientation in the middle of the interval (midpoint rule).
+The usual rule takes the orientation at the start of the interval: at 200 Hz and turns of about
+1 rad/s, it errs by 7.6 mm/s after 0.5 s, and the midpoint rule by 0.03 mm/s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.support.kernels import inner_kernel, kernel
+from vslam.types.geometry import Matrix
+from vslam.types.imu import ImuNoise
+
+NO_BIAS = np.zeros(6)
+NO_BIAS.flags.writeable = False
+
+
+@dataclass(frozen=True, eq=False)
+class Preintegration:
+    """The motion between two times, relative to free fall from the state at the first time.
+
+    Errors are those of ``rotation exp(e_R)``, ``velocity + e_v`` and ``position + e_p``.
+
+    Attributes:
+        seconds: duration.
+        rotation: ``(3, 3)``, maps directions of the frame of the IMU at the end to its frame at the
+            start.
+        velocity: ``(3,)`` m/s in the frame of the IMU at the start.
+        position: ``(3,)`` metres in the frame of the IMU at the start.
+        bias: ``(6,)`` biases that were subtracted, of the gyroscope and of the accelerometer.
+        by_bias: ``(9, 6)`` derivatives of (e_R, e_v, e_p) by the biases.
+        covariance: ``(9, 9)`` of (e_R, e_v, e_p) because of the noise of the samples.
+        longest_gap: longest time in seconds without a sample.
+    """
+
+    seconds: float
+    rotation: Matrix
+    velocity: Matrix
+    position: Matrix
+    bias: Matrix
+    by_bias: Matrix
+    covariance: Matrix
+    longest_gap: float
+
+    def with_bias(self, bias: Matrix) -> Preintegration:
+        """Return the motion for other biases near those that were subtracted, to first order.
+
+        Args:
+            bias: ``(6,)`` biases of the gyroscope and of the accelerometer.
+        """
+        change = self.by_bias @ (bias - self.bias)
+        return Preintegration(
+            self.seconds,
+            self.rotation @ so3_exp(change[:3]),
+            self.velocity + change[3:6],
+            self.position + change[6:],
+            bias,
+            self.by_bias,
+            self.covariance,
+            self.longest_gap,
+        )
+
+
+def preintegrate(
+    samples: Matrix, start: float, end: float, noise: ImuNoise, bias: Matrix = NO_BIAS
+) -> Preintegration:
+    """Integrate inertial samples over exactly the time from ``start`` to ``end``.
+
+    Samples at both ends are interpolated. Before the first and after the last sample, this sample
+    is continued. What is missing is reported as ``longest_gap``; the caller decides whether the
+    result is good enough.
+
+    Args:
+        samples: ``(N, 7)``, at least one, see ``vslam/types/imu.py``. Samples that are far from the
+            interval only cost time.
+        start, end: seconds.
+        bias: ``(6,)`` biases of the gyroscope (rad/s) and the accelerometer (m/s^2), which are
+            subtracted.
+
+    Raises:
+        ValueError: there are no samples, or ``end`` is before ``start``.
+    """
+    if not len(samples):
+        raise ValueError("there are no inertial samples to integrate")
+    if not end >= start:
+        raise ValueError(f"the interval ends at {end} s, before it begins at {start} s")
+    times = samples[:, 0]
+    inside = slice(
+        max(int(np.searchsorted(times, start, "right")) - 1, 0),
+        int(np.searchsorted(times, end, "left")) + 1,
+    )
+    rows = np.ascontiguousarray(samples[inside])
+    found = _integrate(rows, start, end, np.ascontiguousarray(bias), noise.gyro, noise.accel)
+    R, v, p, by_bias, covariance = found
+    gap = _longest_gap(rows[:, 0], start, end)
+    return Preintegration(end - start, R, v, p, np.array(bias), by_bias, covariance, gap)
+
+
+def _longest_gap(times: NDArray[np.float64], start: float, end: float) -> float:
+    """Return the longest time without a sample, of those that touch an interval, in seconds.
+
+    Args:
+        times: of the samples from the last one before the interval to the first one after it.
+    """
+    known = np.concatenate([[min(start, times[0])], times, [max(end, times[-1])]])
+    return float(np.diff(known).max())
+
+
+@kernel
+def so3_exp(w: Matrix) -> Matrix:
+    """Return the ``(3, 3)`` rotation of a ``(3,)`` rotation vector (Rodrigues)."""
+    a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    if a2 < 1e-8:
+        s, c = 1.0 - a2 / 6.0, 0.5 - a2 / 24.0
+    else:
+        a = np.sqrt(a2)
+        s, c = np.sin(a) / a, 2.0 * np.sin(0.5 * a) ** 2 / a2
+    R = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            R[i, j] = c * w[i] * w[j]
+        R[i, i] += 1.0 - c * a2
+    R[0, 1] -= s * w[2]
+    R[0, 2] += s * w[1]
+    R[1, 0] += s * w[2]
+    R[1, 2] -= s * w[0]
+    R[2, 0] -= s * w[1]
+    R[2, 1] += s * w[0]
+    return R
+
+
+@kernel
+def so3_log(R: Matrix) -> Matrix:
+    """Return the ``(3,)`` rotation vector of a ``(3, 3)`` rotation of less than 180 degrees."""
+    w = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sin = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    if sin > 1e-10:
+        w *= np.arctan2(sin, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)) / sin
+    return w
+
+
+@kernel
+def right_jacobian(w: Matrix) -> Matrix:
+    """Return ``(3, 3)`` J with ``exp(w + d) = exp(w) exp(J d)`` for small d."""
+    a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    if a2 < 1e-6:
+        b, c = 0.5 - a2 / 24.0, 1.0 / 6.0 - a2 / 120.0
+    else:
+        a = np.sqrt(a2)
+        b, c = 2.0 * np.sin(0.5 * a) ** 2 / a2, (a - np.sin(a)) / (a2 * a)
+    J = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            J[i, j] = c * w[i] * w[j]
+        J[i, i] += 1.0 - c * a2
+    J[0, 1] += b * w[2]
+    J[0, 2] -= b * w[1]
+    J[1, 0] -= b * w[2]
+    J[1, 2] += b * w[0]
+    J[2, 0] += b * w[1]
+    J[2, 1] -= b * w[0]
+    return J
+
+
+@inner_kernel
+def _times(A: Matrix, B: Matrix) -> Matrix:
+    """Return the product of two small matrices, always summed in the same order."""
+    C = np.zeros((A.shape[0], B.shape[1]))
+    for i in range(A.shape[0]):
+        for k in range(A.shape[1]):
+            for j in range(B.shape[1]):
+                C[i, j] += A[i, k] * B[k, j]
+    return C
+
+
+@inner_kernel
+def _cross_matrix(v: Matrix) -> Matrix:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+@inner_kernel
+def _value_at(rows: Matrix, k: int, time: float) -> Matrix:
+    """Return the ``(6,)`` rate and force at a time, which is not before the sample k."""
+    if time <= rows[k, 0] or k + 1 == len(rows):
+        return rows[k, 1:].copy()
+    share = (time - rows[k, 0]) / (rows[k + 1, 0] - rows[k, 0])
+    return (1.0 - share) * rows[k, 1:] + share * rows[k + 1, 1:]
+
+
+@kernel
+def _integrate(
+    rows: Matrix, start: float, end: float, bias: Matrix, sigma_gyro: float, sigma_accel: float
+) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
+    """Integrate samples from the last one before ``start`` to the first one after ``end``.
+
+    Returns:
+        ``(3, 3)`` rotation, ``(3,)`` velocity, ``(3,)`` position, ``(9, 6)`` derivatives by the
+        biases, and the ``(9, 9)`` covariance (``Preintegration``).
+    """
+    R, v, p = np.eye(3), np.zeros(3), np.zeros(3)
+    J, P = np.zeros((9, 6)), np.zeros((9, 9))
+    A, B = np.eye(9), np.zeros((9, 6))
+    k, time = 0, start
+    value = _value_at(rows, 0, start)
+    while time < end:
+        while k + 1 < len(rows) and rows[k + 1, 0] <= time:
+            k += 1
+        after = end
+        if rows[k, 0] > time:
+            after = min(end, rows[k, 0])
+        elif k + 1 < len(rows):
+            after = min(end, rows[k + 1, 0])
+        at = k + 1 if k + 1 < len(rows) and rows[k + 1, 0] <= after else k
+        following = _value_at(rows, at, after)
+        h = after - time
+        mean = 0.5 * (value + following) - bias
+        w, a = mean[:3], mean[3:]
+
+        half = _times(R, so3_exp(0.5 * h * w))  # the orientation in the middle
+        turn = so3_exp(h * w)
+        force = _times(half, _cross_matrix(a))
+        by_angle = _times(force, so3_exp(-0.5 * h * w))
+        by_rate = _times(force, right_jacobian(0.5 * h * w))
+        by_turn = right_jacobian(h * w)
+        for i in range(3):
+            for j in range(3):
+                A[i, j] = turn[j, i]
+                A[3 + i, j] = -h * by_angle[i, j]
+                A[6 + i, j] = -0.5 * h * h * by_angle[i, j]
+                B[i, j] = -h * by_turn[i, j]
+                B[3 + i, j] = 0.5 * h * h * by_rate[i, j]
+                B[6 + i, j] = 0.25 * h * h * h * by_rate[i, j]
+                B[3 + i, 3 + j] = -h * half[i, j]
+                B[6 + i, 3 + j] = -0.5 * h * h * half[i, j]
+            A[6 + i, 3 + i] = h
+        J = _times(A, J) + B
+        P = _times(_times(A, P), A.T)
+        for i in range(9):
+            for j in range(9):
+                for m in range(6):
+                    sigma = sigma_gyro if m < 3 else sigma_accel
+                    P[i, j] += B[i, m] * B[j, m] * sigma * sigma / h
+        for i in range(3):
+            gain = half[i, 0] * a[0] + half[i, 1] * a[1] + half[i, 2] * a[2]
+            p[i] += v[i] * h + 0.5 * h * h * gain
+            v[i] += h * gain
+        R = _times(R, turn)
+        value, time = following, after
+    return R, v, p, J, P

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vslam.config import Config, LearnedMatchingConfig, VerificationConfig
 from vslam.loopclosure.evidence import evidence_of, probability_wrong, weighed
+from vslam.loopclosure.learned_alignment import aligned
 from vslam.loopclosure.learned_localisation import PoseEstimate, localise, project, view_of
 from vslam.loopclosure.local_matching import DescriptorMaps, likeness, locate_near
 from vslam.loopclosure.reach import within_reach
@@ -114,13 +115,17 @@ def verify_learned(
     if isinstance(estimate, str):
         return replace(edge, reason=estimate)
     learned = estimate
+    refined = aligned(map_, query, keyframes, learned, images, camera, gates.min_inliers)
+    if refined is not None:
+        estimate = refined
     feature, landmark = observed_features(map_, query, estimate, camera, config)
-    # Now that the pose is known, ORB features may match. If enough of them do, their matches are
-    # preferred, because their positions are more precise (about a tenth of a pixel).
+    # Now that the pose is known, ORB features may match. Their pairs of features and landmarks are
+    # preferred, and their pose if too few patches could be aligned.
     place = collect_landmarks(map_.arrays, np.array(keyframes, np.int64), map_.n_landmarks)
     guided = guided_match(map_, query, place, estimate.T_cw, camera, gates)
     if np.count_nonzero(guided.seen) >= gates.min_inliers:
-        estimate = estimate._replace(T_cw=guided.T_cw, covariance=guided.covariance)
+        if refined is None:
+            estimate = estimate._replace(T_cw=guided.T_cw, covariance=guided.covariance)
         pairs = guided.feature[guided.seen], guided.landmarks[guided.seen]
         feature, landmark = joined(pairs, (feature, landmark))
     T_query_match = orthonormalised(estimate.T_cw @ inverse(map_.keyframe_pose(match)))

@@ -74,12 +74,14 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.cli",),
     ("vslam.__main__", "vslam"),
 )
-# Allowed imports within a level, by module. The verification of loops matches features and
-# optimises poses like tracking.
+# Allowed imports within a level, by module. The verification of loops matches features,
+# aligns patches and optimises poses like tracking.
 SIBLINGS = {
     ("vslam.loopclosure.evidence", "vslam.frontend.matching"),
     ("vslam.loopclosure.verification", "vslam.frontend.matching"),
     ("vslam.loopclosure.verification", "vslam.frontend.pose"),
+    ("vslam.loopclosure.learned_alignment", "vslam.frontend.alignment"),
+    ("vslam.loopclosure.learned_alignment", "vslam.frontend.pose"),
     ("vslam.loopclosure.learned_localisation", "vslam.frontend.pnp"),
     ("vslam.loopclosure.learned_localisation", "vslam.frontend.pose"),
 }

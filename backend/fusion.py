@@ -1,4 +1,4 @@
-"""Fusion: merges landmarks that represent the same point in the world (section VI-C of the ORB-SLAM
+"""Fuses landmarks that represent the same point in the world (section VI-C of the ORB-SLAM
 paper)."""
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from vslam.types.loops import LoopEdge
 from vslam.types.map import Map
 from vslam.types.map_kernels import (
     collect_landmarks,
+    fuse_landmarks,
     link,
-    merge_landmarks,
     observed_by,
     predict_octave,
 )
@@ -27,7 +27,7 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
 
     The landmarks of the keyframe are projected into its neighbours, and the landmarks of the
     neighbours into the keyframe. If a projected landmark matches a feature that observes another
-    landmark, the two landmarks are merged. If the feature has no landmark, it becomes an
+    landmark, the two landmarks are fused. If the feature has no landmark, it becomes an
     observation of the projected landmark.
     """
     neighbours = fusion_neighbours(map_, keyframe, config)
@@ -91,7 +91,7 @@ def fuse_loop(
 @kernel
 def _fuse_pairs(a, rows, landmarks, keyframe):
     """Assign each of the given landmarks to a feature of a keyframe. If the feature already
-    observes another landmark, the two landmarks are merged. ``rows`` gives the row of each feature
+    observes another landmark, the two landmarks are fused. ``rows`` gives the row of each feature
     in the observation arrays of the map."""
     for i in range(len(rows)):
         row, landmark = rows[i], landmarks[i]
@@ -99,7 +99,7 @@ def _fuse_pairs(a, rows, landmarks, keyframe):
         if not a.landmark_alive[landmark] or own == landmark:
             continue
         if own >= 0:
-            merge_landmarks(a, own, landmark)
+            fuse_landmarks(a, own, landmark)
         elif observed_by(a, landmark, keyframe) < 0:
             link(a, row, landmark)
 
@@ -204,8 +204,8 @@ def _fuse(
             link(a, best, landmark)
             a.certainty[best] = 1  # not aligned, so its position is no better than a keypoint's
         elif a.n_observations[other] > a.n_observations[landmark]:
-            merge_landmarks(a, landmark, other)
+            fuse_landmarks(a, landmark, other)
         else:
-            merge_landmarks(a, other, landmark)
+            fuse_landmarks(a, other, landmark)
         fused += 1
     return fused

@@ -1,4 +1,4 @@
-"""Takes a snapshot of the map for global bundle adjustment, and merges the solution into the map.
+"""Takes a snapshot of the map for global bundle adjustment, and applies the solution to the map.
 
 Global bundle adjustment takes seconds. It therefore works on a snapshot, while tracking and local
 mapping continue (Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017, section III-D).
@@ -129,7 +129,7 @@ def connected_parts(a, landmarks, n_keyframes):
     return part
 
 
-def merge_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution) -> None:
+def apply_solution(map_: Map, snapshot: GlobalSnapshot, solution: BundleSolution) -> None:
     """Apply the result of global bundle adjustment to the map, which may have changed since the
     snapshot.
 

@@ -1,4 +1,4 @@
-"""A loop detector that merges the candidates of several loop detectors."""
+"""A loop detector that combines the candidates of several loop detectors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vslam.types.map import Map
 
 
 class CombinedDetector:
-    """A :class:`vslam.loopclosure.detector.LoopDetector` that merges the candidates of several
+    """A :class:`vslam.loopclosure.detector.LoopDetector` that combines the candidates of several
     detectors.
 
     The scores of different detectors are not comparable. Therefore, the best candidate of each

@@ -233,9 +233,9 @@ def _check_map(map_: Map) -> None:
         assert a.n_observations[i] == sum(2 if stereo[r] else 1 for r in chain), f"landmark {i}"
         if not alive[i]:
             assert not chain, f"culled landmark {i} is observed"
-        if a.merged_into[i] >= 0:
+        if a.fused_into[i] >= 0:
             assert not alive[i]
-            assert a.merged_into[i] != i
+            assert a.fused_into[i] != i
 
 
 def corridor_depth(camera: Camera, T_wc: np.ndarray) -> np.ndarray:

@@ -85,7 +85,7 @@ LATER = ("report.json", "report.md", "report.html", "figures")  # written after 
 POINTS = (
     Point("a frame's track", "vslam.frontend.tracker.Tracker.track", 200, EARLY),
     Point("keyframe policy", "vslam.method.modes.Building.update_map", 200, EARLY),
-    Point("publishing a keyframe", "vslam.method.published_map.PublishedMap._renew_view", 8, EARLY),
+    Point("publishing a keyframe", "vslam.method.published_map.PublishedMap.renew_view", 8, EARLY),
     Point("place detector, locate", "ring.Oracle.locate", 2, EARLY),
     Point("place detector, add", "ring.Oracle.add", 12, ON),
     Point("place detector, query", "ring.Oracle.query", 12, ON),
@@ -99,7 +99,7 @@ POINTS = (
     Point("closing job, fusion", "vslam.method.closing.fuse_loop", 1, MAPLESS),
     Point("global adjustment, snapshot", "vslam.method.closing.take_snapshot", 1, ON),
     Point("global adjustment", "vslam.method.closing.adjust_globally", 1, ON),
-    Point("global adjustment, merge", "vslam.method.closing.merge_solution", 1, MAPLESS),
+    Point("global adjustment, merge", "vslam.method.closing.apply_solution", 1, MAPLESS),
     Point("image source", "faults.next_image", 200, EARLY),
     Point("image reader", "faults.read_image", 200, EARLY),
     Point("features thread", "vslam.frontend.extraction.find_corners", 200, EARLY),

@@ -53,11 +53,8 @@ class OneKeyframe:
     n_keyframes = 1
     reference = 0
 
-    def keyframe_pose(self, keyframe: int) -> np.ndarray:
-        return np.eye(4)
-
-    def unit_scale(self, keyframe: int) -> float:
-        return 1.0
+    def keyframe(self, keyframe: int) -> tuple[np.ndarray, float]:
+        return np.eye(4), 1.0
 
 
 @dataclass(frozen=True)

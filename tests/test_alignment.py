@@ -350,10 +350,10 @@ def test_a_pose_follows_aligned_matches():
 
 
 def test_the_map_knows_how_sure_each_observation_is(two_keyframes):
-    frame, mapper = two_keyframes
-    known = mapper.view.patches
+    frame, published = two_keyframes
+    known = published.view.patches
     pixels, shift = known.pixels[known.where], known.shift[known.where]
-    map_ = mapper.wait()
+    map_ = published.wait()
     sure = Config().alignment.certainty
     # One feature is tracked and aligned, one is only tracked, and one is new.
     assert map_.arrays.certainty[map_.rows(1)].tolist() == [sure, 1, sure]
@@ -373,10 +373,11 @@ def two_keyframes():
     config = Config()
     closing = LoopClosing(NoDetector(), Verifier(config, CAMERA), CAMERA, config, threads=1)
     mapper = Mapper(CONTEXT, closing, Workers(1))
+    published = mapper.published
     first, second = (frame_of(extracted_at(100, 50, 0, 3), k, 0.1 * k) for k in range(2))
-    mapper.record(first)
+    published.record(first)
     first = mapper.insert(first, None)
-    mapper.record(second)
+    published.record(second)
     shift = np.array([[0.5, -0.25], [np.nan] * 2, [np.nan] * 2], np.float32)
     seen = second.matching(np.arange(2), first.landmark[:2], first.xyz[:2])
-    return mapper.insert(replace(seen, shift=shift), None), mapper
+    return mapper.insert(replace(seen, shift=shift), None), published

@@ -388,7 +388,7 @@ def test_a_global_adjustment_that_fails_leaves_the_map_as_it_was(monkeypatch, ca
     (record,) = caplog.records
     assert record.levelname == "WARNING"
     assert "not positive definite" in record.getMessage()
-    # The next loop is closed, and the result of its adjustment is merged.
+    # The next loop is closed, and the result of its adjustment is applied.
     closing.consider(map_, edge.query, candidates)
     assert len(closing.corrections) == 2
     before = map_.copy().arrays

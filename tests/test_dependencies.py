@@ -60,7 +60,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.method.hypotheses",),
     ("vslam.method.starter", "vslam.method.closing", "vslam.method.motion"),
     ("vslam.method.map_frames", "vslam.method.gaps"),
-    ("vslam.method.published_map", "vslam.method.merging"),
+    ("vslam.method.published_map", "vslam.method.joining"),
     ("vslam.method.mapping",),
     ("vslam.method.modes",),
     ("vslam.method.session",),

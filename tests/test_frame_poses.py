@@ -27,11 +27,8 @@ class Keyframes:
         self.reference = len(self.poses) - 1
         return self.reference
 
-    def keyframe_pose(self, keyframe: int) -> np.ndarray:
-        return self.poses[keyframe]
-
-    def unit_scale(self, keyframe: int) -> float:
-        return self.units[keyframe]
+    def keyframe(self, keyframe: int) -> tuple[np.ndarray, float]:
+        return self.poses[keyframe], self.units[keyframe]
 
 
 def pose(x: float, turn: float = 0.0) -> np.ndarray:

@@ -74,7 +74,7 @@ def test_a_part_that_a_loop_has_joined_is_no_gap(threads):
     part_of_frame = []
     slam, results = run(
         EXACT, frames, Oracle(EXACT, frames), threads=threads,
-        look=lambda slam: part_of_frame.append(slam._session.mapper.view.part),
+        look=lambda slam: part_of_frame.append(slam._session.published.view.part),
     )  # fmt: skip
     assert slam.map.restarts
     assert not slam.gaps()

@@ -1,4 +1,4 @@
-"""Global bundle adjustment optimises a snapshot. Its solution is merged into a changed map."""
+"""Global bundle adjustment optimises a snapshot. Its solution is applied to a changed map."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from test_local_mapping import CAMERA, World, make_world
 
 from vslam.backend.bundle_adjustment import BundleSolution
 from vslam.backend.global_bundle_adjustment import adjust_globally
-from vslam.backend.global_mapping import connected_parts, merge_solution, take_snapshot
+from vslam.backend.global_mapping import apply_solution, connected_parts, take_snapshot
 from vslam.types.geometry import inverse, se3_exp, transform
-from vslam.types.map_kernels import link_many, merge_landmarks
+from vslam.types.map_kernels import fuse_landmarks, link_many
 
 
 def pose(k: int) -> np.ndarray:
@@ -76,7 +76,7 @@ def test_adjusting_a_snapshot_repairs_the_map(check_map):
     n = world.map.n_landmarks
     a.xyz[:n] += 0.1 * rng.normal(size=(n, 3))
     snapshot = take_snapshot(world.map, CAMERA)
-    merge_solution(world.map, snapshot, adjust_globally(snapshot.problem, iterations=30))
+    apply_solution(world.map, snapshot, adjust_globally(snapshot.problem, iterations=30))
     assert np.abs(a.T_cw[:6] - world.truth).max() < 1e-4  # keypoints are float32
     check_map(world.map)
 
@@ -93,7 +93,7 @@ def test_what_was_made_since_moves_along(check_map):
     new = new[new >= 0]
     assert new.min() >= snapshot.n_landmarks
     xyz = map_.arrays.xyz[: map_.n_landmarks].copy()
-    merge_solution(map_, snapshot, shifted(snapshot, MOTION))
+    apply_solution(map_, snapshot, shifted(snapshot, MOTION))
     a = map_.arrays
     for k in range(7):
         np.testing.assert_allclose(a.T_cw[k], pose(k) @ inverse(MOTION), atol=1e-12)
@@ -114,7 +114,7 @@ def test_newer_keyframes_keep_their_pose_relative_to_their_parent():
     rng = np.random.default_rng(3)
     solution = shifted(snapshot, np.eye(4))
     poses = np.array([se3_exp(0.1 * rng.normal(size=6)) @ T for T in snapshot.problem.T_cw])
-    merge_solution(map_, snapshot, BundleSolution(poses, solution.points, 0.0, solution.inlier, 1))
+    apply_solution(map_, snapshot, BundleSolution(poses, solution.points, 0.0, solution.inlier, 1))
     a = map_.arrays
     index = snapshot.keyframes.tolist()
     for k in range(4):
@@ -124,7 +124,7 @@ def test_newer_keyframes_keep_their_pose_relative_to_their_parent():
         np.testing.assert_allclose(after, before, atol=1e-12)
 
 
-def test_culled_and_merged_since_is_respected(check_map):
+def test_what_was_culled_or_fused_since_is_respected(check_map):
     world = world_of(5)
     map_ = world.map
     a = map_.arrays
@@ -132,8 +132,8 @@ def test_culled_and_merged_since_is_respected(check_map):
     map_.cull_keyframe(2)
     relative = map_.keyframe_pose(2) @ inverse(map_.keyframe_pose(1))
     loser, winner = snapshot.landmarks[[3, 40]]
-    merge_landmarks(a, loser, winner)
-    merge_solution(map_, snapshot, shifted(snapshot, MOTION))
+    fuse_landmarks(a, loser, winner)
+    apply_solution(map_, snapshot, shifted(snapshot, MOTION))
     assert not a.keyframe_alive[2]
     assert not a.landmark_alive[loser]
     np.testing.assert_allclose(
@@ -156,18 +156,18 @@ def test_outliers_go_unless_the_row_observes_something_else_by_now(check_map):
     loser = a.landmark[snapshot.rows[rewired]]
     other = map_.add_landmarks(a.xyz[[loser]], a.landmark_descriptor[[loser]], 0)
     a = map_.arrays
-    merge_landmarks(a, loser, other[0])
-    merge_landmarks(a, observed[freed], other[0])
+    fuse_landmarks(a, loser, other[0])
+    fuse_landmarks(a, observed[freed], other[0])
     assert a.landmark[snapshot.rows[freed]] == -1
     inlier = np.ones(len(observed), bool)
     inlier[[gone, rewired, freed]] = False
-    merge_solution(map_, snapshot, shifted(snapshot, MOTION, inlier=inlier))
+    apply_solution(map_, snapshot, shifted(snapshot, MOTION, inlier=inlier))
     assert a.landmark[snapshot.rows[gone]] == -1
     assert a.landmark[snapshot.rows[rewired]] == other[0]
     assert a.landmark[snapshot.rows[freed]] == -1
     kept = np.setdiff1d(np.arange(len(observed)), [gone, rewired, freed])
     unchanged = a.landmark[snapshot.rows[kept]] == observed[kept]
-    assert np.count_nonzero(~unchanged) <= 8  # observations of the two landmarks that were merged
+    assert np.count_nonzero(~unchanged) <= 8  # observations of the two landmarks that were fused
     check_map(map_)
     link_many(a, snapshot.rows[[gone]], observed[[gone]])  # the row is free and usable
     check_map(map_)

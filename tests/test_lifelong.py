@@ -74,15 +74,15 @@ def with_some_of(features: Features, other: Features, n: int) -> Features:
     return Features(*(np.concatenate([mine, theirs[some]]) for mine, theirs in columns))
 
 
-@pytest.mark.parametrize("merge_after_frames", [1, 3])
-def test_a_camera_that_is_carried_is_not_left_where_little_agrees(merge_after_frames):
+@pytest.mark.parametrize("publish_after_frames", [1, 3])
+def test_a_camera_that_is_carried_is_not_left_where_little_agrees(publish_after_frames):
     """A carried camera sees 80 points that look like expected ones.
 
-    Enough of them agree on the same wrong pose. Every frame becomes a keyframe. It is merged when
-    the next frame arrives, or it is still being mapped then.
+    Enough of them agree on the same wrong pose. Every frame becomes a keyframe. It is published
+    when the next frame arrives, or it is still being mapped then.
     """
     places = [*map(float, range(14)), 3.0]
-    keyframes = {"max_interval_s": 0.05, "merge_after_frames": merge_after_frames}
+    keyframes = {"max_interval_s": 0.05, "publish_after_frames": publish_after_frames}
     config = Config.model_validate({"keyframes": keyframes})
     slam = Slam(CAMERA, config, Oracle(RING, places), threads=1)
     for i, place in enumerate(places):

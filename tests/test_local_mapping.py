@@ -337,7 +337,7 @@ def two_keyframes_with_landmarks_of_their_own() -> World:
     return world
 
 
-def test_fusion_merges_the_landmarks_that_two_keyframes_hold_of_a_point(check_map):
+def test_the_landmarks_that_two_keyframes_hold_of_a_point_are_fused(check_map):
     world = two_keyframes_with_landmarks_of_their_own()
     before, both = len(world.map.living_landmarks()), seen_twice(world)
     fused = fuse_into(world.map, world.map.landmarks_of(0), 1, CAMERA, CONFIG)
@@ -376,7 +376,7 @@ def test_fusion_keeps_the_landmark_with_more_observations():
     link_many(a, np.array([world.map.rows(third).start]), np.array([many]))
     fuse_into(world.map, world.map.landmarks_of(0), 1, CAMERA, CONFIG)
     assert (a.landmark_alive[few], a.landmark_alive[many]) == (False, True)
-    assert a.merged_into[few] == many
+    assert a.fused_into[few] == many
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from vslam.types.camera import Camera
 from vslam.types.features import Features, TrackingState, TrackResult
 from vslam.types.loops import LoopEdge
 from vslam.types.map import Map
-from vslam.types.map_kernels import link, link_many, merge_landmarks
+from vslam.types.map_kernels import fuse_landmarks, link, link_many
 
 CAMERA = Camera(100.0, 100.0, 100.0, 50.0, 0.5, 200, 100)
 MATCH, NEIGHBOUR, QUERY = 0, 1, 2
@@ -53,7 +53,7 @@ def closed_map() -> Map:
     # Feature 1 observed a landmark of the query, which was fused with a landmark of the place.
     own = map_.add_landmarks(np.array([[2.0, 1.0, 10.1]]), np.zeros((1, 4), np.uint64), QUERY)
     link(a, map_.rows(QUERY).start + 1, int(own[0]))
-    merge_landmarks(a, int(own[0]), int(place[1]))
+    fuse_landmarks(a, int(own[0]), int(place[1]))
     return map_
 
 

@@ -14,9 +14,9 @@ from vslam.types.map_kernels import (
     collect_landmarks,
     count_seen_by,
     erase_landmark,
+    fuse_landmarks,
     link,
     link_many,
-    merge_landmarks,
     observed_by,
     predict_octave,
     refresh_landmarks,
@@ -62,7 +62,7 @@ def random_map(seed: int, operations: int, each=lambda map_: None) -> Map:
     for _ in range(operations):
         a = map_.arrays
         choice = rng.choice(
-            ["keyframe", "create", "link", "unlink", "merge", "erase", "cull"],
+            ["keyframe", "create", "link", "unlink", "fuse", "erase", "cull"],
             p=[0.06, 0.16, 0.66, 0.05, 0.04, 0.015, 0.015],
         )
         landmarks, keyframes = map_.living_landmarks(), map_.living_keyframes()
@@ -79,8 +79,8 @@ def random_map(seed: int, operations: int, each=lambda map_: None) -> Map:
                 link(a, row, landmark)
         elif choice == "unlink" and len(free) < len(rows):
             unlink(a, int(rng.choice(rows[a.landmark[rows] >= 0])))
-        elif choice == "merge" and len(landmarks) > 1:
-            merge_landmarks(a, *(int(x) for x in rng.choice(landmarks, 2, replace=False)))
+        elif choice == "fuse" and len(landmarks) > 1:
+            fuse_landmarks(a, *(int(x) for x in rng.choice(landmarks, 2, replace=False)))
         elif choice == "erase" and len(landmarks):
             erase_landmark(a, int(rng.choice(landmarks)))
         elif choice == "cull" and len(keyframes) > 3:
@@ -93,7 +93,7 @@ def random_map(seed: int, operations: int, each=lambda map_: None) -> Map:
 def test_invariants_hold_after_each_random_operation(seed, check_map):
     map_ = random_map(seed, 400, check_map)
     assert len(map_.living_landmarks()) > 10
-    assert (map_.arrays.merged_into[: map_.n_landmarks] >= 0).any()
+    assert (map_.arrays.fused_into[: map_.n_landmarks] >= 0).any()
     assert len(map_.living_keyframes()) < map_.n_keyframes
 
 
@@ -162,14 +162,14 @@ def test_merging_keeps_one_row_of_a_keyframe_that_sees_both():
     link_many(a, np.array([0, 4, 8]), np.array([loser] * 3))
     link_many(a, np.array([1]), np.array([winner]))
     a.visible[[loser, winner]], a.found[[loser, winner]] = [10, 5], [7, 3]
-    merge_landmarks(a, loser, winner)
+    fuse_landmarks(a, loser, winner)
     assert a.landmark[[0, 1, 4, 8]].tolist() == [-1, winner, winner, winner]
     assert a.n_observations[[loser, winner]].tolist() == [0, 1 + 1 + 2]
     assert (a.visible[winner], a.found[winner]) == (15, 10)
     assert a.landmark_alive[[loser, winner]].tolist() == [False, True]
 
 
-def test_resolve_follows_chains_of_merges_and_forgets_the_erased():
+def test_resolve_follows_chains_of_fusions_and_forgets_the_erased():
     rng = np.random.default_rng(0)
     map_ = Map(SCALES)
     add_keyframe(map_, rng, 8)
@@ -177,7 +177,7 @@ def test_resolve_follows_chains_of_merges_and_forgets_the_erased():
     link_many(map_.arrays, np.arange(6), np.array(ids))
     a = map_.arrays
     for loser, winner in ((0, 1), (1, 2), (2, 3)):
-        merge_landmarks(a, loser, winner)
+        fuse_landmarks(a, loser, winner)
     erase_landmark(a, 4)
     assert resolve(a, np.array([0, 1, 2, 3, 4, 5, -1], np.int32)).tolist() == [
         3,

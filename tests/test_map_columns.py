@@ -35,7 +35,7 @@ FAMILY = {"parent", "restart"}
 LINKS = {"first_row", "first_keyframe", "keyframe", "landmark", "next_row", "head"}
 # Columns in which not every number is valid.
 RESTRICTED = FAMILY | LINKS | {
-    "T_cw", "T_c_parent", "octave", "keyframe_alive", "landmark_alive", "merged_into",
+    "T_cw", "T_c_parent", "octave", "keyframe_alive", "landmark_alive", "fused_into",
     "n_observations",
 }  # fmt: skip
 

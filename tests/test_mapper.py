@@ -20,12 +20,14 @@ from vslam.loopclosure.detector import NoDetector
 from vslam.method.closing import LoopSearch
 from vslam.method.map_frames import add_revisit
 from vslam.method.mapping import Mapper
+from vslam.method.published_map import PublishedMap
 from vslam.method.starter import TwoViewStart
 from vslam.slam import Slam
 from vslam.support.workers import Workers
 from vslam.types.camera import Camera
 from vslam.types.context import Context
 from vslam.types.features import PATCH_PIXELS, Extracted, Features, KeyframePatches, TrackingState
+from vslam.types.frame_poses import FrameTable
 from vslam.types.geometry import inverse, se3_exp
 from vslam.types.map import Map
 from vslam.types.map_kernels import erase_landmark
@@ -61,7 +63,7 @@ class Closing:
         if self._job is not None:
             self._job(map_, keyframe)
 
-    def merge_adjustment_if_due(self, map_: Map, keyframe: int) -> None:
+    def apply_adjustment_if_due(self, map_: Map, keyframe: int) -> None:
         self.process(map_, keyframe)
 
     def search(self, map_: Map, keyframe: int, features: Features, image) -> LoopSearch:
@@ -116,25 +118,31 @@ class Drive:
         config = Config.model_validate({"keyframes": keyframes, "tracking": tracking or {}})
         self.context = Context.create(camera, config)
         self.closing = closing or Closing()
-        self.mapper = Mapper(self.context, self.closing, workers or Workers(1))
+        self.continue_in(None, workers=workers)
         self.last: Track | None = None
         self._see, self._at = see, poses
 
+    def continue_in(
+        self, map_: Map | None, frames: FrameTable | None = None, workers: Workers | None = None
+    ) -> None:
+        self.mapper = Mapper(self.context, self.closing, workers or Workers(1), map_, frames)
+        self.published = self.mapper.published
+
     def next_frame(self) -> Track:
         """Return the next frame at its true pose, tracked in the mapper's view of the map."""
-        k, view = len(self.mapper.frames), self.mapper.view
+        k, view = len(self.published.frames), self.published.view
         extracted = with_offset(Extracted(self._see(k)), view.disparity_offset)
         frame = replace(frame_of(extracted, k, 0.1 * k, self._at(k)), state=TrackingState.OK)
         if view.n_keyframes:
             frame = track_local_map(frame, view.local_landmarks, self.context, window=8.0)
-            self.mapper.count(frame)
+            self.published.count(frame)
         return frame
 
     def step(self, *, keyframe: bool = False) -> Track:
         """Track the next frame and record it. If requested, make it a keyframe."""
-        self.mapper.publish(frame=len(self.mapper.frames))
+        self.published.publish(frame=len(self.published.frames))
         frame = self.next_frame()
-        self.mapper.record(frame)
+        self.published.record(frame)
         self.last = self.mapper.insert(frame, None) if keyframe else frame
         return self.last
 
@@ -160,51 +168,51 @@ def bytes_of_map(map_: Map) -> bytes:
 
 def test_the_first_keyframe_is_mapped_at_once():
     drive = Drive()
-    assert (drive.mapper.n_keyframes, drive.mapper.is_published) == (0, True)
+    assert (drive.published.n_keyframes, drive.published.is_published) == (0, True)
     drive.step(keyframe=True)
-    assert drive.mapper.n_keyframes == 1
-    assert drive.mapper.is_published
-    assert not drive.mapper.is_mapping
-    assert len(drive.mapper.view.local_landmarks.ids) == drive.mapper.map.n_landmarks > 50
+    assert drive.published.n_keyframes == 1
+    assert drive.published.is_published
+    assert not drive.published.is_mapping
+    assert len(drive.published.view.local_landmarks.ids) == drive.published.map.n_landmarks > 50
 
 
 @late_and_early
 @pytest.mark.parametrize("after", [1, 2, 4])
 def test_a_keyframe_is_published_at_the_frame_that_is_due_and_no_other(workers, after):
-    drive = Drive(workers(), merge_after_frames=after)
+    drive = Drive(workers(), publish_after_frames=after)
     drive.steps([0, 3], 4)
-    mapper, shown = drive.mapper, drive.mapper.view
-    assert (mapper.last_frame, shown.reference, shown.n_keyframes) == (3, 1, 2)
+    published, shown = drive.published, drive.published.view
+    assert (published.last_frame, shown.reference, shown.n_keyframes) == (3, 1, 2)
     for _ in range(after - 1):
         drive.step()
-        assert (mapper.is_published, mapper.is_mapping) == (False, True)
-        assert mapper.view is shown
+        assert (published.is_published, published.is_mapping) == (False, True)
+        assert published.view is shown
     drive.step()
-    assert (mapper.is_published, mapper.is_mapping) == (True, False)
-    assert mapper.view is not shown
-    assert len(mapper.view.local_landmarks.ids) > len(
+    assert (published.is_published, published.is_mapping) == (True, False)
+    assert published.view is not shown
+    assert len(published.view.local_landmarks.ids) > len(
         shown.local_landmarks.ids
     )  # with two keyframes, landmarks are triangulated
-    merged = mapper.view
+    now = published.view
     drive.step()
-    assert mapper.view is merged
+    assert published.view is now
 
 
 @late_and_early
 def test_whoever_changes_the_map_publishes_first(workers):
     for use in (
-        lambda drive: drive.mapper.publish(),
+        lambda drive: drive.published.publish(),
         lambda drive: drive.mapper.finish(),
-        lambda drive: drive.mapper.settle(drive.last),
+        lambda drive: drive.published.complete(drive.last),
         lambda drive: drive.mapper.map_far_points(drive.last),
         lambda drive: drive.mapper.insert(drive.last, None),
     ):
-        drive = Drive(workers(), merge_after_frames=9)
+        drive = Drive(workers(), publish_after_frames=9)
         drive.steps([0, 3], 4)
-        shown = drive.mapper.view
+        shown = drive.published.view
         use(drive)
-        assert drive.mapper.is_published == (drive.mapper.n_keyframes == 2)
-        assert len(drive.mapper.view.local_landmarks.ids) > len(shown.local_landmarks.ids)
+        assert drive.published.is_published == (drive.published.n_keyframes == 2)
+        assert len(drive.published.view.local_landmarks.ids) > len(shown.local_landmarks.ids)
 
 
 def test_a_keyframe_publishes_the_one_before():
@@ -214,10 +222,12 @@ def test_a_keyframe_publishes_the_one_before():
     assert processed == [0]
     drive.step(keyframe=True)
     assert processed == [0, 1]
-    assert not drive.mapper.is_published  # the new keyframe is not published
+    assert not drive.published.is_published  # the new keyframe is not published
 
 
-def trace_on_the_ring(workers, look: Callable[[Mapper], object] = lambda mapper: None) -> list:
+def trace_on_the_ring(
+    workers, look: Callable[[PublishedMap], object] = lambda published: None
+) -> list:
     """Return what tracking sees at each frame of the ring, and the final map.
 
     The features are noisy. ``look`` is called after each frame.
@@ -231,18 +241,18 @@ def trace_on_the_ring(workers, look: Callable[[Mapper], object] = lambda mapper:
     seen = []
     for k in range(16):
         frame = drive.step(keyframe=k in (0, 2, 5, 6, 9, 13))
-        mapper = drive.mapper
+        published = drive.published
         assert np.count_nonzero(frame.landmark >= 0) > 200
-        counts = (mapper.is_published, mapper.reference, mapper.n_keyframes)
-        poses = [frame.T_cw, *(mapper.frames.pose(i) for i in (-1, mapper.last_frame))]
-        seen.append((counts, bytes_of_view(mapper.view), np.array(poses).tobytes()))
-        look(mapper)
+        counts = (published.is_published, published.reference, published.n_keyframes)
+        poses = [frame.T_cw, *(published.frames.pose(i) for i in (-1, published.last_frame))]
+        seen.append((counts, bytes_of_view(published.view), np.array(poses).tobytes()))
+        look(published)
     drive.mapper.finish()
     assert (
         len({view for _, view, _ in seen}) == 10
     )  # each keyframe and each publication changes the view
-    trajectory = drive.mapper.trajectory().T_wc.tobytes()
-    return [*seen, bytes_of_map(drive.mapper.map), trajectory]
+    trajectory = drive.published.trajectory().T_wc.tobytes()
+    return [*seen, bytes_of_map(drive.published.map), trajectory]
 
 
 def test_nothing_tells_whether_a_keyframe_is_mapped_early_or_late():
@@ -250,65 +260,65 @@ def test_nothing_tells_whether_a_keyframe_is_mapped_early_or_late():
 
 
 def test_completing_a_keyframe_early_changes_no_result():
-    assert trace_on_the_ring(Workers(1), Mapper.wait) == trace_on_the_ring(Workers(1))
+    assert trace_on_the_ring(Workers(1), PublishedMap.wait) == trace_on_the_ring(Workers(1))
 
 
 @late_and_early
 def test_completing_shows_tracking_nothing(workers):
-    drive = Drive(workers(), merge_after_frames=9)
+    drive = Drive(workers(), publish_after_frames=9)
     drive.steps([0, 3], 5)
-    mapper, shown = drive.mapper, drive.mapper.view
-    map_ = mapper.wait()
+    published, shown = drive.published, drive.published.view
+    map_ = published.wait()
     assert len(np.unique(map_.arrays.first_keyframe[: map_.n_landmarks])) == 2
-    assert (mapper.is_published, mapper.is_mapping) == (False, False)
-    assert mapper.view is shown
-    assert mapper.wait() is map_  # the second call returns the same map
-    mapper.publish()
-    assert mapper.view is not shown
+    assert (published.is_published, published.is_mapping) == (False, False)
+    assert published.view is shown
+    assert published.wait() is map_  # the second call returns the same map
+    published.publish()
+    assert published.view is not shown
 
 
 @late_and_early
 def test_the_map_is_not_to_be_had_while_a_keyframe_is_mapped(workers):
-    drive = Drive(workers(), merge_after_frames=9)
+    drive = Drive(workers(), publish_after_frames=9)
     drive.steps([0, 3], 5)
-    for use in (lambda: drive.mapper.map, drive.mapper.trajectory):
+    for use in (lambda: drive.published.map, drive.published.trajectory):
         with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
             use()
     # Frames are placed by the reference keyframe. Other keyframes may be moving.
-    np.testing.assert_array_equal(drive.mapper.keyframe_pose(1), drive.mapper.view.T_reference)
+    np.testing.assert_array_equal(drive.published.keyframe(1)[0], drive.published.view.T_reference)
     with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
-        drive.mapper.keyframe_pose(0)
+        drive.published.keyframe(0)
 
 
 def test_a_trajectory_is_not_to_be_had_even_if_all_frames_follow_the_reference_keyframe():
     """This is the state at the beginning of a new drive in an existing map."""
     drive = Drive()
     drive.steps([0, 3], 6)
-    map_ = drive.mapper.wait()
-    drive.mapper = Mapper(drive.context, drive.closing, Workers(1), map_)
+    map_ = drive.published.wait()
+    drive.continue_in(map_)
     drive.step(keyframe=True)
     with pytest.raises(RuntimeError, match="a keyframe is being mapped"):
-        drive.mapper.trajectory()
+        drive.published.trajectory()
 
 
 @late_and_early
 def test_the_map_counts_what_frames_saw_when_it_is_free(workers):
-    drive = Drive(workers(), merge_after_frames=9)
+    drive = Drive(workers(), publish_after_frames=9)
     drive.steps([0, 3], 4)
     visible, found = np.array([3, 4, 5], np.int32), np.array([4], np.int32)
     for _ in range(2):
-        drive.mapper.count(replace(drive.last, visible=visible, landmark=found))
+        drive.published.count(replace(drive.last, visible=visible, landmark=found))
     counters = [], []
-    for one in (drive, Drive(workers(), merge_after_frames=9)):
+    for one in (drive, Drive(workers(), publish_after_frames=9)):
         if one is not drive:
             one.steps([0, 3], 4)
-        arrays = one.mapper.wait().arrays
+        arrays = one.published.wait().arrays
         counters[0].append(arrays.visible[3:6].copy())
         counters[1].append(arrays.found[3:6].copy())
     np.testing.assert_array_equal(counters[0][0] - counters[0][1], [2, 2, 2])
     np.testing.assert_array_equal(counters[1][0] - counters[1][1], [0, 2, 0])
     before = arrays.visible[3]
-    drive.mapper.wait()
+    drive.published.wait()
     assert arrays.visible[3] == before  # each frame counts once
 
 
@@ -325,21 +335,21 @@ def test_frames_move_with_the_map(workers):
         for k in range(keyframe + 1 if keyframe else 0):
             map_.arrays.T_cw[k] = map_.arrays.T_cw[k] @ MOVES[k]
 
-    drive = Drive(workers(), Closing(move), merge_after_frames=9)
+    drive = Drive(workers(), Closing(move), publish_after_frames=9)
     drive.step(keyframe=True)
     placed = drive.step()
-    T_0 = drive.mapper.view.T_reference
+    T_0 = drive.published.view.T_reference
     drive.step(keyframe=True)
-    T_1 = drive.mapper.view.T_reference
+    T_1 = drive.published.view.T_reference
     unplaced = drive.next_frame()
     before = [frame.T_cw.copy() for frame in (placed, unplaced)]
-    moved = drive.mapper.publish(placed, unplaced)
-    after = drive.mapper.map.arrays.T_cw
+    moved = drive.published.publish(placed, unplaced)
+    after = drive.published.map.arrays.T_cw
     assert np.linalg.norm((after[0] @ inverse(T_0))[:3, 3]) > 0.1
     np.testing.assert_allclose(moved[0].T_cw, before[0] @ inverse(T_0) @ after[0], atol=1e-12)
     np.testing.assert_allclose(moved[1].T_cw, before[1] @ inverse(T_1) @ after[1], atol=1e-12)
     np.testing.assert_array_equal(placed.T_cw, before[0])  # what was passed is not changed
-    np.testing.assert_array_equal(moved[0].T_cw, drive.mapper.frames.pose(placed.index))
+    np.testing.assert_array_equal(moved[0].T_cw, drive.published.frames.pose(placed.index))
 
 
 @late_and_early
@@ -352,11 +362,11 @@ def test_moved_frames_track_what_became_of_their_landmarks(workers):
             map_.arrays.xyz[: map_.n_landmarks] += 0.25
             map_.scalars = replace(map_.scalars, disparity_offset=0.125)
 
-    drive = Drive(workers(), Closing(change), merge_after_frames=9)
+    drive = Drive(workers(), Closing(change), publish_after_frames=9)
     drive.steps([0, 3], 4)
     held = [drive.last, drive.next_frame()]
-    moved = drive.mapper.publish(*held)
-    arrays = drive.mapper.map.arrays
+    moved = drive.published.publish(*held)
+    arrays = drive.published.map.arrays
     for frame, before in zip(moved, held, strict=True):
         assert gone in before.landmark
         expected = np.where(before.landmark == gone, -1, before.landmark)
@@ -366,7 +376,7 @@ def test_moved_frames_track_what_became_of_their_landmarks(workers):
         assert np.isnan(frame.xyz[~known]).all()
         u_right = before.features.u_right
         np.testing.assert_allclose(frame.features.u_right, u_right - 0.125, atol=1e-4)
-    assert drive.mapper.view.disparity_offset == 0.125
+    assert drive.published.view.disparity_offset == 0.125
 
 
 def see_without_depth(k: int) -> Features:
@@ -378,7 +388,7 @@ def see_without_depth(k: int) -> Features:
 def monocular_drive(workers, closing: Closing) -> Drive:
     """Make a monocular map of two keyframes that are 0.6 m apart."""
     camera = CAMERA.left_camera()
-    drive = Drive(workers, closing, camera, see_without_depth, merge_after_frames=9)
+    drive = Drive(workers, closing, camera, see_without_depth, publish_after_frames=9)
     begin_with_two_views(drive)
     return drive
 
@@ -388,7 +398,7 @@ def begin_with_two_views(drive: Drive) -> None:
     for _ in range(4):
         lost = replace(drive.next_frame(), T_cw=np.eye(4), state=TrackingState.LOST)
         frames.append(lost)
-        drive.mapper.record(lost)
+        drive.published.record(lost)
     every = np.arange(len(POINTS.xyz))
     views, images = (frames[0], frames[3]), (None, None)
     drive.last = drive.mapper.begin(TwoViewStart(*views, images, at(3), (every, every), POINTS.xyz))
@@ -397,10 +407,10 @@ def begin_with_two_views(drive: Drive) -> None:
 def test_a_monocular_map_begins_with_two_keyframes():
     processed = []
     drive = monocular_drive(None, Closing(lambda map_, k: processed.append(k)))
-    map_, second = drive.mapper.map, drive.last
+    map_, second = drive.published.map, drive.last
     assert processed == [0, 1]
-    assert (drive.mapper.is_published, drive.mapper.last_frame) == (True, 3)
-    assert drive.mapper.last_timestamp == second.timestamp
+    assert (drive.published.is_published, drive.published.last_frame) == (True, 3)
+    assert drive.published.last_timestamp == second.timestamp
     assert (map_.frames.tolist(), map_.parents.tolist()) == ([0, 3], [-1, 0])
     assert map_.n_landmarks == 240
     scale = np.linalg.norm(map_.arrays.T_cw[1][:3, 3]) / np.linalg.norm(at(3)[:3, 3])
@@ -426,7 +436,7 @@ def test_where_the_unit_of_a_monocular_map_changes_speeds_and_poses_change_with_
     drive.step(keyframe=True)
     unplaced = drive.next_frame()
     held = [replace(frame, twist=np.arange(1.0, 7.0)) for frame in (placed, unplaced)]
-    moved = drive.mapper.publish(*held)
+    moved = drive.published.publish(*held)
     for frame, before in zip(moved, held, strict=True):
         np.testing.assert_allclose(frame.twist, [2, 4, 6, 4, 5, 6])
         # All positions are measured from the first keyframe, which is the origin.
@@ -448,16 +458,16 @@ def test_where_culled_landmarks_are_dropped_frames_track_the_same_points(adjusti
             for landmark in range(0, 60, 3):
                 erase_landmark(map_.arrays, landmark)
 
-    drive = Drive(None, Closing(kill), merge_after_frames=9)
+    drive = Drive(None, Closing(kill), publish_after_frames=9)
     drive.steps([0, 3], 4)
-    drive.mapper.publish()
+    drive.published.publish()
     drive.closing.is_adjusting = adjusting
     monkeypatch.setattr(Map, "many_culled_landmarks", True)
     drive.step()
     new = drive.next_frame()
-    drive.mapper.record(new)
+    drive.published.record(new)
     keyframe = drive.mapper.insert(new, None)
-    map_ = drive.mapper.wait()
+    map_ = drive.published.wait()
     assert map_.arrays.landmark_alive[: map_.n_landmarks].all() != adjusting
     known = new.landmark >= 0
     assert np.array_equal(keyframe.landmark[known], new.landmark[known]) == adjusting
@@ -472,27 +482,27 @@ def test_where_culled_landmarks_are_dropped_frames_track_the_same_points(adjusti
 def test_a_frame_may_be_placed_by_the_keyframe_near_which_it_was_found():
     drive = Drive()
     drive.steps([0, 3], 6)
-    assert drive.mapper.reference == 1
+    assert drive.published.reference == 1
     frame = replace(drive.next_frame(), near=0)
-    drive.mapper.record(frame)
-    assert drive.mapper.reference == 0
-    assert drive.mapper.frames.table().reference[-1] == 0
-    np.testing.assert_allclose(drive.mapper.frames.pose(-1), frame.T_cw, atol=1e-12)
+    drive.published.record(frame)
+    assert drive.published.reference == 0
+    assert drive.published.frames.table().reference[-1] == 0
+    np.testing.assert_allclose(drive.published.frames.pose(-1), frame.T_cw, atol=1e-12)
 
 
 def test_the_reference_can_be_the_keyframe_that_shares_the_most_with_a_frame():
     drive = Drive(see=lambda k: POINTS.see(at(k), slice(20 * k, 20 * k + 100)))
     drive.steps([0, 3], 6)
-    mapper, frame = drive.mapper, drive.next_frame()
-    mapper.refer_to(0)
-    mapper.refer_to_nearest(frame)
-    assert mapper.reference == 1
-    others = frame.without(np.isin(frame.landmark, mapper.map.landmarks_of(1)))
-    mapper.refer_to_nearest(others)
-    assert mapper.reference == 1  # the frame shares no landmark with any keyframe
-    old = np.setdiff1d(mapper.map.landmarks_of(0), mapper.map.landmarks_of(1))[:20]
-    mapper.refer_to_nearest(replace(frame, landmark=old))
-    assert mapper.reference == 0
+    published, frame = drive.published, drive.next_frame()
+    published.refer_to(0)
+    published.refer_to_nearest(frame)
+    assert published.reference == 1
+    others = frame.without(np.isin(frame.landmark, published.map.landmarks_of(1)))
+    published.refer_to_nearest(others)
+    assert published.reference == 1  # the frame shares no landmark with any keyframe
+    old = np.setdiff1d(published.map.landmarks_of(0), published.map.landmarks_of(1))[:20]
+    published.refer_to_nearest(replace(frame, landmark=old))
+    assert published.reference == 0
 
 
 @pytest.mark.parametrize(("known_after_s", "known"), [(0.5, True), (0.51, False)])
@@ -504,7 +514,7 @@ def test_a_place_is_old_when_its_keyframe_is(known_after_s, known):
     place = drive.mapper.find_old_place(frame)
     assert (place is not None) == known
     if place is not None:
-        map_ = drive.mapper.map
+        map_ = drive.published.map
         shared = np.intersect1d(frame.landmark, map_.landmarks_of(0))
         assert (place.keyframe, place.n_shared) == (0, len(shared))
         assert place.n_place == 0  # only two keyframes see anything
@@ -513,37 +523,37 @@ def test_a_place_is_old_when_its_keyframe_is(known_after_s, known):
 def test_what_is_seen_at_a_known_place_is_kept_a_few_times():
     drive = Drive(known_after_s=0.3)
     drive.steps([0, 3], 6)
-    mapper, frame = drive.mapper, drive.last
+    mapper, published, frame = drive.mapper, drive.published, drive.last
     mapper.use_existing_keyframe(mapper.find_old_place(frame), frame)
-    revisits = mapper.map.revisits
+    revisits = published.map.revisits
     assert revisits.keyframe.tolist() == [0]
     np.testing.assert_array_equal(revisits.landmark, frame.tracked)
-    T_cw = revisits.T_c_keyframe[0] @ mapper.map.keyframe_pose(0)
+    T_cw = revisits.T_c_keyframe[0] @ published.map.keyframe_pose(0)
     np.testing.assert_allclose(T_cw, frame.T_cw, atol=1e-12)
-    kept = [add_revisit(mapper.map, 0, frame, 1) for _ in range(2 * MAX_REVISITS)]
+    kept = [add_revisit(published.map, 0, frame, 1) for _ in range(2 * MAX_REVISITS)]
     assert kept == [True] * (MAX_REVISITS - 1) + [False] * (MAX_REVISITS + 1)
-    assert len(mapper.map.revisits) == MAX_REVISITS
+    assert len(published.map.revisits) == MAX_REVISITS
 
 
 @pytest.mark.parametrize("is_due", [False, True])
 def test_an_old_keyframe_can_serve_in_place_of_a_new_one(is_due):
-    """It also counts for the merge of a global bundle adjustment whose result is due."""
+    """It also counts for a global bundle adjustment whose result is due."""
     drive = Drive(known_after_s=0.3)
     drive.steps([0, 3], 6)
-    mapper, frame = drive.mapper, drive.last
+    mapper, published, frame = drive.mapper, drive.published, drive.last
     drive.closing.is_due = is_due
     mapper.use_existing_keyframe(mapper.find_old_place(frame), frame)
-    assert (mapper.reference, mapper.n_keyframes) == (0, 2)
-    assert mapper.last_timestamp == frame.timestamp
-    assert mapper.frames.table().reference[-1] == 0
-    np.testing.assert_allclose(mapper.frames.pose(-1), frame.T_cw, atol=1e-12)
-    assert mapper.last_frame == (frame.index if is_due else 3)
-    assert (mapper.is_mapping, mapper.is_published) == (is_due, not is_due)
+    assert (published.reference, published.n_keyframes) == (0, 2)
+    assert published.last_timestamp == frame.timestamp
+    assert published.frames.table().reference[-1] == 0
+    np.testing.assert_allclose(published.frames.pose(-1), frame.T_cw, atol=1e-12)
+    assert published.last_frame == (frame.index if is_due else 3)
+    assert (published.is_mapping, published.is_published) == (is_due, not is_due)
     drive.step()
     assert drive.closing.finished == 0
     drive.step()  # two frames later
     assert drive.closing.finished == is_due
-    assert mapper.is_published
+    assert published.is_published
 
 
 def with_an_image(frame):
@@ -556,10 +566,10 @@ def with_an_image(frame):
 def test_at_a_known_place_the_patches_are_those_of_the_frame_until_the_next_keyframe():
     drive = Drive(known_after_s=0.3)
     drive.steps([0, 3], 6)
-    mapper, frame = drive.mapper, with_an_image(drive.last)
+    mapper, published, frame = drive.mapper, drive.published, with_an_image(drive.last)
     mapper.use_existing_keyframe(mapper.find_old_place(frame), frame)
-    shown = mapper.view.patches
-    tracked = np.flatnonzero(np.isin(frame.landmark, mapper.view.local_landmarks.ids))
+    shown = published.view.patches
+    tracked = np.flatnonzero(np.isin(frame.landmark, published.view.local_landmarks.ids))
     of_frame = dict(zip(frame.landmark[tracked].tolist(), tracked.tolist(), strict=True))
     assert shown.ids.tolist() == sorted(of_frame)
     feature = np.array([of_frame[k] for k in shown.ids.tolist()])
@@ -572,33 +582,32 @@ def test_at_a_known_place_the_patches_are_those_of_the_frame_until_the_next_keyf
     np.testing.assert_array_equal(shown.angle, frame.features.angle[feature])
     np.testing.assert_allclose(shown.T_cw[shown.view[0]], frame.T_cw, atol=1e-12)
 
-    again = Mapper(
-        drive.context, drive.closing, Workers(1), mapper.map.copy(), mapper.frames.table()
-    )  # fmt: skip
-    again.restore(mapper.state())
-    assert bytes_of_view(again.view) == bytes_of_view(mapper.view)
+    again = Drive()
+    again.continue_in(published.map.copy(), published.frames.table())
+    again.published.restore(published.state())
+    assert bytes_of_view(again.published.view) == bytes_of_view(published.view)
 
     drive.step(keyframe=True)
-    assert mapper.state().known_place is None
-    assert not len(mapper.view.patches.ids)  # the keyframes of this drive have no images
+    assert published.state().known_place is None
+    assert not len(published.view.patches.ids)  # the keyframes of this drive have no images
 
 
 def test_far_points_are_mapped_of_the_first_keyframe_while_it_is_the_only_one():
     drive = Drive()
     frame = drive.step(keyframe=True)
-    near, n = drive.mapper.view, np.count_nonzero(frame.landmark >= 0)
+    near, n = drive.published.view, np.count_nonzero(frame.landmark >= 0)
     # Another frame is not the frame of the keyframe.
     assert drive.mapper.map_far_points(drive.next_frame()) is None
     frame = drive.mapper.map_far_points(frame)
     assert n < len(frame.tracked) == 240
-    assert len(drive.mapper.view.local_landmarks.ids) == 240 > len(near.local_landmarks.ids)
+    assert len(drive.published.view.local_landmarks.ids) == 240 > len(near.local_landmarks.ids)
     assert np.isfinite(frame.xyz).all()
     assert drive.mapper.map_far_points(frame) is None  # there are no more far points
     drive = Drive()
     first = drive.step(keyframe=True)
     second = drive.step(keyframe=True)
     assert drive.mapper.map_far_points(second) is None
-    drive.mapper.refer_to(0)
+    drive.published.refer_to(0)
     assert drive.mapper.map_far_points(first) is None
 
 
@@ -620,8 +629,8 @@ def fail(map_: Map, keyframe: int) -> None:
 @pytest.mark.parametrize(
     "first",
     [
-        lambda drive: drive.mapper.publish(),
-        lambda drive: drive.mapper.wait(),
+        lambda drive: drive.published.publish(),
+        lambda drive: drive.published.wait(),
         lambda drive: drive.mapper.finish(),
         lambda drive: drive.mapper.insert(drive.last, None),
         lambda drive: drive.steps([], 6),
@@ -629,34 +638,34 @@ def fail(map_: Map, keyframe: int) -> None:
     ids=["publish", "wait", "finish", "insert", "drive"],
 )
 def test_a_job_that_fails_says_so_once_and_the_map_says_so_from_then_on(workers, first):
-    drive = Drive(workers(), Closing(fail), merge_after_frames=3)
+    drive = Drive(workers(), Closing(fail), publish_after_frames=3)
     drive.steps([0, 3], 5)
-    mapper, frame = drive.mapper, drive.last
-    view, pose = mapper.view, mapper.frames.pose(-1).tobytes()
+    mapper, published, frame = drive.mapper, drive.published, drive.last
+    view, pose = published.view, published.frames.pose(-1).tobytes()
     with pytest.raises(BrokenError):
         first(drive)
     two, none = np.arange(2), (None, None)
     start = TwoViewStart(frame, frame, none, at(1), (two, two), POINTS.xyz[:2])
     for use in (
-        lambda: mapper.map,
-        mapper.publish,
-        mapper.settle,
-        mapper.wait,
+        lambda: published.map,
+        published.publish,
+        published.complete,
+        published.wait,
         mapper.finish,
-        mapper.trajectory,
-        lambda: mapper.publish(frame=99),
+        published.trajectory,
+        lambda: published.publish(frame=99),
         lambda: mapper.insert(frame, None),
         lambda: mapper.map_far_points(frame),
         lambda: mapper.begin(start),
         lambda: mapper.find_old_place(frame),
-        lambda: mapper.refer_to(0),
-        lambda: mapper.refer_to_nearest(frame),
-        lambda: mapper.keyframe_pose(0),
+        lambda: published.refer_to(0),
+        lambda: published.refer_to_nearest(frame),
+        lambda: published.keyframe(0),
     ):
         with pytest.raises(RuntimeError, match=INCOMPLETE):
             use()
-    assert mapper.view is view
-    assert mapper.frames.pose(4).tobytes() == pose
+    assert published.view is view
+    assert published.frames.pose(4).tobytes() == pose
 
 
 @pytest.mark.parametrize(
@@ -677,7 +686,7 @@ def test_a_change_that_fails_where_no_job_runs_leaves_no_other_map(failing, chan
     drive = Drive(closing=Closing(fail), see=see_without_depth)
     with pytest.raises(BrokenError):
         change(drive)
-    for use in (lambda: drive.mapper.map, drive.mapper.wait, drive.mapper.finish):
+    for use in (lambda: drive.published.map, drive.published.wait, drive.mapper.finish):
         with pytest.raises(RuntimeError, match=INCOMPLETE):
             use()
 
@@ -744,23 +753,21 @@ def test_a_mapper_that_is_restored_goes_on_as_the_one_that_was_not():
     """The reference keyframe is not the newest one, as after relocalisation."""
     one = Drive()
     one.steps([0, 3], 6)
-    one.mapper.record(replace(one.next_frame(), near=0))
-    state, map_ = one.mapper.state(), one.mapper.wait()
+    one.published.record(replace(one.next_frame(), near=0))
+    state, map_ = one.published.state(), one.published.wait()
     other = Drive()
-    other.mapper = Mapper(
-        other.context, other.closing, Workers(1), map_.copy(), one.mapper.frames.table()
-    )
-    assert other.mapper.reference == 1  # the newest keyframe, where nothing else is known
-    other.mapper.restore(state)
-    assert other.mapper.state() == state == MapperState(0, 3, pytest.approx(0.3), ())
-    assert bytes_of_view(other.mapper.view) == bytes_of_view(one.mapper.view)
+    other.continue_in(map_.copy(), one.published.frames.table())
+    assert other.published.reference == 1  # the newest keyframe, where nothing else is known
+    other.published.restore(state)
+    assert other.published.state() == state == MapperState(0, 3, pytest.approx(0.3), ())
+    assert bytes_of_view(other.published.view) == bytes_of_view(one.published.view)
     for drive in (one, other):
         drive.last = None
         drive.step(keyframe=True)
         drive.step()
         drive.mapper.finish()
-    assert bytes_of_map(other.mapper.map) == bytes_of_map(one.mapper.map)
-    tables = [drive.mapper.frames.table() for drive in (one, other)]
+    assert bytes_of_map(other.published.map) == bytes_of_map(one.published.map)
+    tables = [drive.published.frames.table() for drive in (one, other)]
     for mine, theirs in zip(*tables, strict=True):
         np.testing.assert_array_equal(mine, theirs)
 
@@ -777,25 +784,25 @@ def test_the_patches_of_keyframes_are_part_of_the_state():
         )
         for keyframe in (0, 1)
     )
-    drive.mapper.restore(MapperState(1, 3, 0.3, patches))
-    again = drive.mapper.state().patches
+    drive.published.restore(MapperState(1, 3, 0.3, patches))
+    again = drive.published.state().patches
     assert len(again) == 2
     for mine, theirs in zip(again, patches, strict=True):
         assert mine.keyframe == theirs.keyframe
         np.testing.assert_array_equal(mine.pixels, theirs.pixels)
         np.testing.assert_array_equal(mine.shift, theirs.shift)
-    shown = drive.mapper.view.patches
-    assert set(shown.ids) == set(drive.mapper.map.landmarks_of(1))
+    shown = drive.published.view.patches
+    assert set(shown.ids) == set(drive.published.map.landmarks_of(1))
 
 
 @pytest.mark.parametrize("same_drive", [True, False])
 def test_only_the_same_drive_counts_frames_from_its_newest_keyframe(same_drive):
-    one = Drive()
-    one.steps([0, 3], 6)
-    map_ = one.mapper.map.copy()
+    drive = Drive()
+    drive.steps([0, 3], 6)
+    map_ = drive.published.map.copy()
     if not same_drive:
         map_.begin_drive()
-    other = Mapper(one.context, one.closing, Workers(1), map_, one.mapper.frames.table())
-    other.continue_drive()
-    assert other.last_frame == (3 if same_drive else -1)
-    assert other.last_timestamp == (map_.timestamps[1] if same_drive else -np.inf)
+    drive.continue_in(map_, drive.published.frames.table())
+    drive.published.continue_drive()
+    assert drive.published.last_frame == (3 if same_drive else -1)
+    assert drive.published.last_timestamp == (map_.timestamps[1] if same_drive else -np.inf)

@@ -38,14 +38,14 @@ class Mapped(Drive):
         """Make a map with keyframes at the frames 0 and 3. Two more frames follow."""
         drive = cls(**options)
         drive.steps([0, 3], 6)
-        drive.mapper.publish()
+        drive.published.publish()
         return drive
 
     def recorded_frame(self, **changes) -> Track:
         """Return the next frame, which tracks all landmarks that it should see, as recorded."""
         frame = self.next_frame()
         frame = replace(frame, visible=frame.tracked, by=By.FEATURES, **changes)
-        self.mapper.record(frame)
+        self.published.record(frame)
         return frame
 
     def lost_frame(self, n: int = 1) -> Track:
@@ -55,7 +55,7 @@ class Mapped(Drive):
 
     def standing(self, frame: Track) -> Track:
         ids, xy = np.arange(50, dtype=np.int32), np.zeros((50, 2), np.float32)
-        return replace(frame, still=Standstill(np.eye(4), ids, xy, self.mapper.n_keyframes))
+        return replace(frame, still=Standstill(np.eye(4), ids, xy, self.published.n_keyframes))
 
     def update(self, frame: Track) -> Track:
         """Update the map with a recorded frame."""
@@ -71,18 +71,18 @@ class Mapped(Drive):
 def test_localising_leaves_the_map_alone():
     """The map is byte-identical, including the counts of how often landmarks were seen."""
     drive = Mapped.with_a_map()
-    mapper, drive.mode = drive.mapper, Localising(drive.mapper)
+    published, drive.mode = drive.published, Localising(drive.published)
     mode = drive.mode
     lost, tracked = drive.lost_frame(10), drive.recorded_frame()
-    before = bytes_of_map(mapper.wait())
+    before = bytes_of_map(published.wait())
     assert mode.begin(lost, None) is lost
     assert mode.map_far_points(drive.last) is None
     assert drive.update(lost) is lost
     assert drive.update(tracked) is tracked
     mode.restore(PolicyState(1.0, True))
-    mapper.finish()
-    assert bytes_of_map(mapper.map) == before
-    assert mapper.n_keyframes == 2
+    drive.mapper.finish()
+    assert bytes_of_map(published.map) == before
+    assert published.n_keyframes == 2
     assert mode.state() is None
     assert not mode.changes_map
 
@@ -90,12 +90,12 @@ def test_localising_leaves_the_map_alone():
 def test_localising_tracks_by_the_keyframe_that_shares_the_most_with_a_frame():
     drive = Mapped(see=lambda k: POINTS.see(at(k), slice(20 * k, 20 * k + 100)))
     drive.steps([0, 3], 6)
-    drive.mapper.publish()
+    drive.published.publish()
     frame = drive.recorded_frame()
-    drive.mapper.refer_to(0)
-    drive.mode = Localising(drive.mapper)
+    drive.published.refer_to(0)
+    drive.mode = Localising(drive.published)
     drive.update(frame)
-    assert drive.mapper.reference == 1
+    assert drive.published.reference == 1
 
 
 # -- the beginning of a map -----------------------------------------------------------------------
@@ -105,7 +105,7 @@ def test_a_stereo_frame_begins_a_map():
     drive = Mapped()
     frame = drive.mode.begin(drive.lost_frame(), None)
     assert frame.is_keyframe
-    assert drive.mapper.n_keyframes == 1
+    assert drive.published.n_keyframes == 1
     assert len(frame.tracked) > 50
     assert drive.mode.state().gain_awaited
     assert drive.mode.changes_map
@@ -119,7 +119,7 @@ def test_a_map_needs_a_frame_with_enough_depths(camera, n_stereo, begins):
     frame.features.u_right[n_stereo:] = np.nan
     before = drive.mode.state()
     assert drive.mode.begin(frame, None).is_keyframe == begins
-    assert drive.mapper.n_keyframes == begins
+    assert drive.published.n_keyframes == begins
     assert (drive.mode.state() == before) != begins
 
 
@@ -131,8 +131,8 @@ def test_a_monocular_map_begins_with_the_second_view():
         second = drive.mode.begin(drive.lost_frame(), None)
         if second.is_keyframe:
             break
-    assert drive.mapper.n_keyframes == 2
-    assert drive.mapper.map.frames.tolist() == [0, second.index]
+    assert drive.published.n_keyframes == 2
+    assert drive.published.map.frames.tolist() == [0, second.index]
     assert drive.mode.state() is not None
     assert drive.mode.state().gain_awaited is False
 
@@ -145,7 +145,7 @@ def test_a_sub_map_is_placed_by_the_prediction_if_the_speed_is_known(twist):
     assert (frame.landmark >= 0).any()
     begun = drive.mode.begin(frame, None)
     assert (begun.is_keyframe, begun.twist) == (True, None)
-    map_ = drive.mapper.wait()
+    map_ = drive.published.wait()
     assert map_.restarts == [2]
     assert map_.unpredicted_restarts == ([] if twist is not None else [2])
     assert map_.parents[2] == 1
@@ -157,7 +157,7 @@ def test_a_lost_stereo_camera_begins_a_sub_map_sooner_in_a_young_map(young_keyfr
     drive = Mapped.with_a_map(tracking={"young_keyframes": young_keyframes})
     for n in range(1, patience + 1):
         assert drive.update(drive.lost_frame()).is_keyframe == (n == patience)
-    assert drive.mapper.n_keyframes == 3
+    assert drive.published.n_keyframes == 3
 
 
 def test_a_lost_monocular_camera_looks_for_a_first_view_after_four_frames():
@@ -186,12 +186,12 @@ def test_a_frame_that_is_lost_right_after_a_map_began_may_see_more_of_it():
     drive = Mapped()
     assert drive.mode.map_far_points(None) is None  # there is no keyframe
     first = drive.mode.begin(drive.lost_frame(), None)
-    shown = len(drive.mapper.view.local_landmarks.ids)
+    shown = len(drive.published.view.local_landmarks.ids)
     # A later frame was tracked.
     assert drive.mode.map_far_points(replace(first, twist=TWIST)) is None
-    assert len(drive.mapper.view.local_landmarks.ids) == shown
+    assert len(drive.published.view.local_landmarks.ids) == shown
     more = drive.mode.map_far_points(first)
-    assert len(more.tracked) == len(drive.mapper.view.local_landmarks.ids) == 240 > shown
+    assert len(more.tracked) == len(drive.published.view.local_landmarks.ids) == 240 > shown
     assert drive.mode.map_far_points(more) is None  # there are no more far points
 
 
@@ -208,12 +208,12 @@ def test_a_monocular_map_has_no_far_points_to_show():
 def test_a_frame_that_shows_nothing_new_is_only_counted():
     drive = Mapped.with_a_map(min_tracked_close=0)
     frame = drive.recorded_frame()
-    before = drive.mapper.wait().copy().arrays
+    before = drive.published.wait().copy().arrays
     lost = np.flatnonzero(frame.landmark >= 0)[:5]
     gone = frame.landmark[lost]
     assert not drive.update(frame.without(lost)).is_keyframe
-    assert drive.mapper.n_keyframes == 2
-    after = drive.mapper.wait().copy().arrays
+    assert drive.published.n_keyframes == 2
+    after = drive.published.wait().copy().arrays
     seen = np.zeros(len(before.visible), int)
     seen[frame.visible] = 1
     np.testing.assert_array_equal(after.visible - before.visible, seen)
@@ -225,9 +225,9 @@ def test_a_frame_becomes_a_keyframe_when_it_is_time():
     drive = Mapped.with_a_map(max_interval_s=0.5, min_tracked_close=0)
     made = [drive.update(drive.recorded_frame()).is_keyframe for _ in range(3)]
     assert made == [False, False, True]  # frames 6, 7 and 8; the previous keyframe is frame 3
-    assert drive.mapper.last_frame == 8
+    assert drive.published.last_frame == 8
     assert drive.mode.state().gain_awaited
-    assert not drive.mapper.is_published
+    assert not drive.published.is_published
 
 
 @pytest.mark.parametrize("stands_still", [True, False])
@@ -249,7 +249,7 @@ def test_a_camera_that_comes_to_rest_at_its_reference_keyframe_makes_no_other(
 ):
     """Another keyframe is made if it has moved by a tenth of the baseline, or by three pixels."""
     drive = Mapped.with_a_map(max_interval_s=0.05)
-    T_cw = ahead(metres, pixels / CAMERA.fx) @ drive.mapper.view.T_reference
+    T_cw = ahead(metres, pixels / CAMERA.fx) @ drive.published.view.T_reference
     frame = drive.standing(replace(drive.recorded_frame(), T_cw=T_cw))
     assert drive.update(frame).is_keyframe != stays
 
@@ -257,11 +257,11 @@ def test_a_camera_that_comes_to_rest_at_its_reference_keyframe_makes_no_other(
 @pytest.mark.parametrize(("idle", "made"), [(True, True), (False, False)])
 def test_a_frame_that_is_not_urgent_waits_for_mapping(idle, made):
     """The frame tracks seven tenths of the landmarks that the reference keyframe sees."""
-    drive = Mapped.with_a_map(min_tracked_close=0, merge_after_frames=50, max_interval_s=50.0)
+    drive = Mapped.with_a_map(min_tracked_close=0, publish_after_frames=50, max_interval_s=50.0)
     if not idle:
         drive.mapper.insert(drive.recorded_frame(), None)
-    assert drive.mapper.is_published == idle
-    rest = slice(int(0.7 * drive.mapper.view.n_reference), None)
+    assert drive.published.is_published == idle
+    rest = slice(int(0.7 * drive.published.view.n_reference), None)
     assert drive.update(drive.recorded_frame().without(rest)).is_keyframe == made
 
 
@@ -271,9 +271,9 @@ def test_at_an_old_place_no_keyframe_is_made(known_after_s, known):
     frame = drive.recorded_frame()
     drive.mode.restore(PolicyState(100.0, gain_awaited=False))
     assert drive.update(frame).is_keyframe != known
-    assert drive.mapper.n_keyframes == (2 if known else 3)
-    assert drive.mapper.reference == (0 if known else 2)
-    assert drive.mapper.last_timestamp == frame.timestamp
+    assert drive.published.n_keyframes == (2 if known else 3)
+    assert drive.published.reference == (0 if known else 2)
+    assert drive.published.last_timestamp == frame.timestamp
     assert drive.mode.state().gain_awaited  # the next frame is compared with this one
 
 
@@ -286,8 +286,8 @@ def test_a_place_is_known_by_the_features_of_a_frame_that_was_tracked_by_patches
     drive.mode._tracker.match_features = lambda *_: by_features
     drive.mode.restore(PolicyState(100.0, gain_awaited=False, due=frame.index))
     assert drive.update(frame) is by_features
-    assert drive.mapper.n_keyframes == 2
-    assert drive.mapper.reference == 0
+    assert drive.published.n_keyframes == 2
+    assert drive.published.reference == 0
 
 
 @pytest.mark.parametrize(("n_tracked", "n_shared", "n_place", "known"), [

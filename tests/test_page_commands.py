@@ -207,7 +207,7 @@ RULES = {
             ("--seq 00` writes", "--seq 00 --save-map town.npz` writes"),
             ("--point 20,140", "--point 0,2"),
         ),
-        (("vslam map merge", "its drives must meet; test_map_merge.py has some"),),
+        (("vslam map merge", "its drives must meet; test_joining.py has some"),),
     ),
     "docs/research/motorway.md": Rules(
         not_run=(

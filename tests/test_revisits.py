@@ -9,7 +9,7 @@ from test_global_mapping import pose, world_of
 from test_local_mapping import CAMERA, make_world
 
 from vslam.backend.global_bundle_adjustment import adjust_globally
-from vslam.backend.global_mapping import merge_solution, take_snapshot
+from vslam.backend.global_mapping import apply_solution, take_snapshot
 from vslam.maps.stored_map import StoredMap, appended, selected
 from vslam.method.map_frames import sees_old_place
 from vslam.types.geometry import inverse, se3_exp
@@ -68,7 +68,7 @@ def test_what_a_revisit_measured_moves_the_map():
                 new = seen_from(world, k, pose(k))
                 world.map.revisits = world.map.revisits.followed_by(new)
         snapshot = take_snapshot(world.map, CAMERA)
-        merge_solution(world.map, snapshot, adjust_globally(snapshot.problem, iterations=30))
+        apply_solution(world.map, snapshot, adjust_globally(snapshot.problem, iterations=30))
         error = world.map.arrays.xyz[: len(truth)] - truth
         return float(np.median(np.linalg.norm(error, axis=1)))
 
@@ -81,7 +81,7 @@ def test_the_pose_of_a_revisit_is_adjusted_and_follows_its_keyframe():
     wrong = se3_exp(np.array([0.05, 0.0, 0.05, 0.0, 0.01, 0.0])) @ revisit.T_c_keyframe[0]
     world.map.revisits = revisit.moved(wrong[None])
     snapshot = take_snapshot(world.map, CAMERA)
-    merge_solution(world.map, snapshot, adjust_globally(snapshot.problem, iterations=30))
+    apply_solution(world.map, snapshot, adjust_globally(snapshot.problem, iterations=30))
     found = world.map.revisits.T_c_keyframe[0]
     np.testing.assert_allclose(found, revisit.T_c_keyframe[0], atol=1e-4)
     before = found @ world.map.keyframe_pose(2)

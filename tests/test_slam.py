@@ -179,7 +179,7 @@ def test_two_in_threads_of_their_own_have_the_bytes_of_one(corridor):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
-def test_tracking_sees_nothing_of_mapping_before_the_merge(corridor, config, monkeypatch):
+def test_tracking_sees_nothing_of_mapping_before_it_is_published(corridor, config, monkeypatch):
     """Mapping runs as early or as late as possible. A race would lead to different results."""
     late = bytes_of(*run(corridor, config, threads=1))
     monkeypatch.setattr("vslam.slam.Workers", InstantWorkers)
@@ -206,7 +206,7 @@ def test_the_pose_is_known_before_a_frame_becomes_a_keyframe(corridor):
     known = []
 
     def note(result):
-        known.append((result, slam._session.mapper.n_keyframes))
+        known.append((result, slam._session.published.n_keyframes))
 
     results = [
         slam.step(left, right, timestamp, on_pose=note)
@@ -214,10 +214,10 @@ def test_the_pose_is_known_before_a_frame_becomes_a_keyframe(corridor):
             corridor.left[:6], corridor.right[:6], corridor.timestamps[:6], strict=True
         )
     ]
-    assert [n for _, n in known] == [1, 1, 2, 3, 4, 5]  # keyframes merged so far
+    assert [n for _, n in known] == [1, 1, 2, 3, 4, 5]  # keyframes published so far
     for (first, _), result in zip(known[1:], results[1:], strict=True):
         assert (first.is_keyframe, result.is_keyframe) == (False, True)
-        # The insertion merges the previous keyframe, which may move the frame slightly.
+        # The insertion publishes the previous keyframe, which may move the frame slightly.
         np.testing.assert_allclose(first.T_wc, result.T_wc, atol=0.02)
 
 
@@ -235,7 +235,7 @@ def test_the_map_cannot_be_read_while_a_keyframe_is_mapped(corridor):
 
 @pytest.mark.slow
 def test_map_stays_sound_with_a_keyframe_each_frame(corridor, check_map):
-    """Fusion merges two landmarks that the current frame tracks."""
+    """Two landmarks are fused that the current frame tracks."""
     slam, results = run(corridor, EAGER)
     assert all(r.is_keyframe for r in results)
     assert states(results) == "O" * len(corridor)
@@ -275,7 +275,7 @@ def test_black_frames_are_lost_at_the_predicted_pose_and_tracking_recovers(corri
 
 @pytest.mark.parametrize("after", [0, 1, 2])
 def test_a_black_frame_soon_after_a_keyframe_does_not_move_the_frame_before(corridor, after):
-    """The result of mapping is merged before, at or after the black frame."""
+    """The result of mapping is published before, at or after the black frame."""
     _, plain = run(corridor)
     keyframe = next(r.index for r in plain if r.is_keyframe and r.index > 10)
     slam = Slam(corridor.camera, CONFIG, "none", threads=1)
@@ -284,7 +284,7 @@ def test_a_black_frame_soon_after_a_keyframe_does_not_move_the_frame_before(corr
     for k in range(black):
         slam.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
     last = slam.frame
-    for k in (black, black + 1):  # two frames, so that the merge is done
+    for k in (black, black + 1):  # two frames, so that it is published
         slam.step(nothing, nothing, corridor.timestamps[k])
     assert slam.frame.index == last.index == black - 1
     slam.finish()
@@ -534,7 +534,7 @@ def test_the_capsule_network_beside_the_bag_of_words_is_the_default(corridor):
 def test_a_keyframe_that_cannot_be_mapped_is_the_last_thing_that_happens(
     corridor, monkeypatch, tmp_path
 ):
-    """The step that merges it raises an error. After that, the incomplete map is not used."""
+    """The step that publishes it raises an error. After that, the incomplete map is not used."""
     slam = Slam(corridor.camera, EAGER, "none", threads=1)
 
     def drive(frames: range) -> None:

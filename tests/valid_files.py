@@ -200,7 +200,7 @@ def map_file(folder: Path) -> None:
     from vslam.types.frame_poses import FrameTable
     from vslam.types.loops import LoopEdge, ResembledPlace
     from vslam.types.map import Map
-    from vslam.types.map_kernels import link_many, merge_landmarks, refresh_landmarks
+    from vslam.types.map_kernels import fuse_landmarks, link_many, refresh_landmarks
     from vslam.types.states import (
         Checkpoint,
         ClosingState,
@@ -229,7 +229,7 @@ def map_file(folder: Path) -> None:
         rows = np.arange(n * k, n * (k + 1))
         link_many(map_.arrays, rows, ids.astype(np.int32))
     refresh_landmarks(map_.arrays, ids, map_.scales)
-    merge_landmarks(map_.arrays, 0, 1)
+    fuse_landmarks(map_.arrays, 0, 1)
     map_.cull_keyframe(1)
     waits = LoopEdge(2, 0, 0.5, True, "", T_query_match=np.eye(4))
     patches = KeyframePatches(

@@ -156,7 +156,7 @@ def _use_map_in(file: Path, other: Path, out: Path) -> None:
     from vslam.maps.reconstruction import reconstruction_of
     from vslam.maps.storage import load_map
     from vslam.maps.stored_map import in_box
-    from vslam.method.merging import merge_maps
+    from vslam.method.joining import join_maps
     from vslam.slam import Slam
     from vslam.support.errors import InputError
 
@@ -179,7 +179,7 @@ def _use_map_in(file: Path, other: Path, out: Path) -> None:
             load_map(out / "again.npz")
     config = Config()
     try:
-        merge_maps([load_map(other), stored], config, lambda: detector_with_images("bow", config))
+        join_maps([load_map(other), stored], config, lambda: detector_with_images("bow", config))
     except ValueError as error:  # as ``vslam map merge`` does
         raise InputError(str(error)) from error
 

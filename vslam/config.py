@@ -14,14 +14,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from vslam.support.errors import InputError, did_you_mean, plain_reason
 
 _Model = TypeVar("_Model", bound=BaseModel)
-# Older maps and configurations have other names for some thresholds of the section ``learned``.
+# Older maps and configurations have other names for some thresholds, by section.
 _RENAMED = {
-    "rated": "max_compared",
-    "min_alike": "min_similarity",
-    "rest": "retry_interval",
-    "more_alike": "retry_factor",
-    "coarse_alike": "min_coarse_similarity",
-    "alike": "min_fine_similarity",
+    "keyframes": {"merge_after_frames": "publish_after_frames"},
+    "learned": {
+        "rated": "max_compared",
+        "min_alike": "min_similarity",
+        "rest": "retry_interval",
+        "more_alike": "retry_factor",
+        "coarse_alike": "min_coarse_similarity",
+        "alike": "min_fine_similarity",
+    },
 }
 
 
@@ -374,7 +377,7 @@ class KeyframeConfig(Section):
     keyframe. With a larger fraction, more new keyframes are inserted at old places. [own]"""
     known_min_inliers: int = Field(50, ge=0)
     """A place is known only if the frame tracks at least this many landmarks. [own]"""
-    merge_after_frames: int = Field(2, ge=1)
+    publish_after_frames: int = Field(2, ge=1)
     """Tracking uses the result of local mapping this many frames after the keyframe. If the next
     keyframe comes earlier, tracking uses the result there. With a smaller value, tracking waits for
     mapping more often. [own]"""
@@ -604,7 +607,7 @@ class LoopConfig(Section):
     """Upper bound of the number of iterations of global bundle adjustment.
     [OS2 III-D, customary]"""
     observations_per_keyframe: int = Field(25000, ge=1)
-    """The result of global bundle adjustment is merged `1 + n // observations_per_keyframe`
+    """The result of global bundle adjustment is applied `1 + n // observations_per_keyframe`
     keyframes after its loop, where n is the number of observations. With a smaller value, mapping
     waits for the result less often. [own]"""
     min_revisits: int = Field(5, ge=1)
@@ -794,9 +797,10 @@ class Config(Section):
                 nested[section] = {**values, key: given[name]}
             else:
                 nested[name] = given[name]  # validation reports it as an unknown key
-        learned, verification = nested.get("learned"), nested.get("verification")
-        if isinstance(learned, dict):
-            nested["learned"] = {_RENAMED.get(key, key): value for key, value in learned.items()}
+        for section, names in _RENAMED.items():
+            if isinstance(values := nested.get(section), dict):
+                nested[section] = {names.get(key, key): value for key, value in values.items()}
+        verification = nested.get("verification")
         if isinstance(verification, dict) and verification.get("descriptors") == "usual":
             nested["verification"] = {**verification, "descriptors": "auto"}
         return nested
@@ -806,7 +810,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "fast": {
         "orb.n_features": 1200,
         "keyframes.patch_kept_close": 0.3,
-        "keyframes.merge_after_frames": 3,
+        "keyframes.publish_after_frames": 3,
         "mapping.neighbours": 5,
     }
 }

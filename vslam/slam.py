@@ -272,7 +272,7 @@ class Slam:
         Raises:
             RuntimeError: a keyframe is being mapped. Check ``is_mapping``, or call ``finish()``.
         """
-        return self._session.mapper.map
+        return self._session.published.map
 
     @property
     def frame(self) -> Track | None:
@@ -287,7 +287,7 @@ class Slam:
     @property
     def is_mapping(self) -> bool:
         """Whether a keyframe is being mapped."""
-        return self._session.mapper.is_mapping
+        return self._session.published.is_mapping
 
     @property
     def is_adjusting(self) -> bool:
@@ -315,7 +315,7 @@ class Slam:
 
     def trajectory(self) -> Trajectory:
         """Return the pose of every frame. The poses of lost frames are interpolated."""
-        return _as_mounted(self._session.mapper.trajectory(), self.context.camera)
+        return _as_mounted(self._session.published.trajectory(), self.context.camera)
 
     def keyframe_trajectory(self) -> Trajectory:
         """Return the poses of the keyframes of this drive, without culled keyframes."""
@@ -326,7 +326,7 @@ class Slam:
 
         Sub-maps that closed loops have joined to the first sub-map count as part of it.
         """
-        return in_first_part(self.map, self._session.closing.closed, self._session.mapper.frames)
+        return in_first_part(self.map, self._session.closing.closed, self._session.published.frames)
 
     def gaps(self) -> list[Gap]:
         """Return the stretches of this drive whose poses relative to the world were not measured.
@@ -337,5 +337,5 @@ class Slam:
         Raises:
             RuntimeError: a keyframe is being mapped. Check ``is_mapping``, or call ``finish()``.
         """
-        closing, mapper = self._session.closing, self._session.mapper
-        return find_gaps(self.map, closing.closed, mapper.frames, self.context)
+        closing, published = self._session.closing, self._session.published
+        return find_gaps(self.map, closing.closed, published.frames, self.context)

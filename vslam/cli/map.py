@@ -141,7 +141,7 @@ def merge(
     from vslam.cli.console import Console
     from vslam.loopclosure.registry import detector_with_images
     from vslam.maps.storage import load_map, map_file_of
-    from vslam.method.merging import Memory, merge_maps
+    from vslam.method.joining import Memory, join_maps
 
     if len(maps) < 2:
         raise InputError(f"{maps[0]}: a single map cannot be merged; give two or more.")
@@ -170,7 +170,7 @@ def merge(
     keyframes = sum(one.map.n_keyframes for one in stored[1:])
     try:
         with Console(shown=not quiet).count_bar("keyframes", keyframes) as advance:
-            merged = merge_maps(stored, thresholds, create, advance)
+            merged = join_maps(stored, thresholds, create, advance)
     except ValueError as error:
         raise InputError(f"{files[0]} and the others cannot be merged: {error}.") from error
     if not quiet:

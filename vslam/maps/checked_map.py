@@ -43,7 +43,7 @@ FILE_NAMES = {
     )
     for name in fields
     if name not in _NOT_IN_FILE
-}
+} | {"fused_into": "landmark_merged_into"}
 _SIZES = {"keyframe": "K", "landmark": "L", "row": "R"}
 
 
@@ -197,7 +197,7 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     observed = np.diff(first) > 0
     _require(bool(observed[alive].all()), "a landmark without observations that is not culled")
     _require(bool(alive[observed].all()), "a culled landmark with observations")
-    _check_merges(data["landmark_merged_into"], alive)
+    _check_fused(data["landmark_merged_into"], alive)
     _check_ids("observation_row", rows, n_rows)
     _require(_all_differ(rows), "a keypoint that observes two landmarks")
     _check_ids("landmark_first_keyframe", data["landmark_first_keyframe"], n)
@@ -226,17 +226,17 @@ def _revisits(data: dict[str, NDArray], sizes: dict[str, int]) -> Revisits:
     return revisits
 
 
-def _check_merges(merged_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:
-    """Check that every chain of ``merged_into`` ends at a landmark that was not culled, or at
+def _check_fused(fused_into: NDArray[np.int32], alive: NDArray[np.bool_]) -> None:
+    """Check that every chain of ``fused_into`` ends at a landmark that was not culled, or at
     -1."""
-    n = len(merged_into)
-    _check_ids("landmark_merged_into", merged_into, n, least=NONE)
-    _require(bool((merged_into[alive] == NONE).all()), "a merged landmark that is not culled")
-    # This is pointer doubling. Each round follows twice as many merges as the round before.
-    reached = np.append(np.where(merged_into >= 0, merged_into, n), n)
+    n = len(fused_into)
+    _check_ids("landmark_merged_into", fused_into, n, least=NONE)
+    _require(bool((fused_into[alive] == NONE).all()), "a fused landmark that is not culled")
+    # This is pointer doubling. Each round follows twice as many fusions as the round before.
+    reached = np.append(np.where(fused_into >= 0, fused_into, n), n)
     for _ in range(n.bit_length()):
         reached = reached[reached]
-    _require(bool((reached == n).all()), "landmarks merged in a circle")
+    _require(bool((reached == n).all()), "landmarks fused in a circle")
 
 
 def _loops(data: dict[str, NDArray], n: int) -> tuple[LoopEdge, ...]:

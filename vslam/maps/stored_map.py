@@ -230,7 +230,7 @@ def appended(one: StoredMap, other: StoredMap) -> StoredMap:
     n, drives = a.n_keyframes, a.scalars.session + 1
     shift = {
         "first_row": a.n_rows, "first_keyframe": n, "keyframe": n, "landmark": a.n_landmarks,
-        "merged_into": a.n_landmarks, "head": a.n_rows, "next_row": a.n_rows, "parent": n,
+        "fused_into": a.n_landmarks, "head": a.n_rows, "next_row": a.n_rows, "parent": n,
         "session": drives,
     }  # fmt: skip
 

@@ -2,9 +2,9 @@
 
 No other thread may write the map while a method of ``LoopClosing`` runs. The search for a loop only
 reads the map and runs in parallel with tracking (``Mapper``). The global bundle adjustment after a
-loop also runs in parallel, on a snapshot of the map. Its result is merged after a certain number of
-keyframes. This number depends only on the size of the problem, so the same input always gives the
-same map.
+loop also runs in parallel, on a snapshot of the map. Its result is applied after a certain number
+of keyframes. This number depends only on the size of the problem, so the same input always gives
+the same map.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from vslam.backend.bundle_adjustment import BundleSolution
 from vslam.backend.fusion import fuse_loop
 from vslam.backend.global_bundle_adjustment import adjust_globally
-from vslam.backend.global_mapping import GlobalSnapshot, merge_solution, take_snapshot
+from vslam.backend.global_mapping import GlobalSnapshot, apply_solution, take_snapshot
 from vslam.backend.local_mapping import adjust_locally, strong_neighbours
 from vslam.backend.loop_correction import move_keyframes
 from vslam.backend.similarity_graph import loop_in_new_units, move_keyframes_similarly
@@ -85,7 +85,7 @@ class LoopClosing:
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
     ) -> None:
         """Search for loops at a keyframe. If a loop is found, close it."""
-        self.merge_adjustment_if_due(map_, keyframe)
+        self.apply_adjustment_if_due(map_, keyframe)
         self.close(map_, self.search(map_, keyframe, features, image))
 
     def search(
@@ -140,20 +140,20 @@ class LoopClosing:
 
     @property
     def is_adjusting(self) -> bool:
-        """Whether a global bundle adjustment is running, or its result has not been merged yet."""
+        """Whether a global bundle adjustment is running, or its result has not been applied yet."""
         return self._global is not None
 
     def count_reused_keyframe(self, map_: Map, *, new: bool) -> bool:
         """Record that an old keyframe became the reference keyframe instead of a new keyframe.
 
-        The result of the global bundle adjustment is merged after a certain number of keyframes. A
+        The result of the global bundle adjustment is applied after a certain number of keyframes. A
         reused keyframe also counts towards this number.
 
         Args:
             new: whether the map has a new revisit.
 
         Returns:
-            Whether the result of the global bundle adjustment must be merged now.
+            Whether the result of the global bundle adjustment must be applied now.
         """
         self._followed += 1
         if new:
@@ -178,8 +178,8 @@ class LoopClosing:
             with self._failure_reported("Global bundle adjustment after a loop"):
                 self._global = self._start_global(map_, map_.n_keyframes - 1)
 
-    def merge_adjustment_if_due(self, map_: Map, keyframe: int) -> None:
-        """Merge the result of the global bundle adjustment if it is due at this keyframe."""
+    def apply_adjustment_if_due(self, map_: Map, keyframe: int) -> None:
+        """Apply the result of the global bundle adjustment if it is due at this keyframe."""
         if self._is_due(keyframe):
             self.finish(map_)
 
@@ -205,7 +205,7 @@ class LoopClosing:
         self.adjust_after_revisits(map_)
 
     def finish(self, map_: Map) -> None:
-        """Wait for the running global bundle adjustment, if there is one, and merge its result.
+        """Wait for the running global bundle adjustment, if there is one, and apply its result.
 
         The map is valid without this result. If the adjustment fails, a warning is logged and the
         map stays as it was.
@@ -217,7 +217,7 @@ class LoopClosing:
         with self._failure_reported("Global bundle adjustment after a loop"):
             solution = pending.solution()
         if solution is not None:
-            merge_solution(map_, pending.snapshot, solution)
+            apply_solution(map_, pending.snapshot, solution)
 
     @contextmanager
     def _failure_reported(self, what: str) -> Iterator[None]:

@@ -126,7 +126,8 @@ def has_more_points(map_: Map, keyframe: int, track: Track) -> bool:
 
 def observe_keyframe(track: Track, map_: Map, keyframe: int) -> Track:
     """Return a frame that became a keyframe with all landmarks that this keyframe observes."""
-    return with_landmarks(track, map_.arrays.landmark[map_.rows(keyframe)], map_)
+    track = with_landmarks(track, map_.arrays.landmark[map_.rows(keyframe)], map_)
+    return replace(track, is_keyframe=True)
 
 
 def with_landmarks(track: Track, landmark: NDArray[np.int32], map_: Map) -> Track:

@@ -8,19 +8,17 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-
 from vslam.backend.disparity_offset import map_and_calibrate
 from vslam.backend.local_mapping import refresh_keyframe
 from vslam.backend.triangulation import map_stereo_points
-from vslam.frontend.patches import certainty_of, patches_of_frame
+from vslam.frontend.patches import certainty_of
 from vslam.frontend.track import Track
+from vslam.method.closing import LoopClosing
 from vslam.method.map_frames import (
     OldPlace,
     add_frame,
     add_revisit,
     add_two_views,
-    count_shared_landmarks,
     find_old_place,
     has_more_points,
     observe_keyframe,
@@ -28,12 +26,35 @@ from vslam.method.map_frames import (
 )
 from vslam.method.published_map import PublishedMap
 from vslam.method.starter import TwoViewStart
+from vslam.support.workers import Workers
 from vslam.types.camera import Image
+from vslam.types.context import Context
+from vslam.types.frame_poses import FrameTable
 from vslam.types.map import Map
 
 
-class Mapper(PublishedMap):
-    """The owner of the map. Only its methods, and the jobs that it starts, change the map."""
+class Mapper:
+    """Adds frames to the map. Only its methods, and the jobs that they start, change the map.
+
+    Attributes:
+        published: the map, and what tracking sees of it.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        closing: LoopClosing,
+        workers: Workers,
+        map_: Map | None = None,
+        frames: FrameTable | None = None,
+    ) -> None:
+        """
+        Args:
+            workers, map_, frames: see ``PublishedMap``.
+        """
+        self.published = PublishedMap(context, closing, workers, map_, frames)
+        self._context = context
+        self._closing = closing
 
     def insert(self, track: Track, image: Image | None, *, predicted: bool = True) -> Track:
         """Make the newest frame a keyframe, map its stereo points and start its mapping job.
@@ -47,27 +68,27 @@ class Mapper(PublishedMap):
         Returns:
             The frame with all landmarks of its keyframe.
         """
-        (track,) = self.settle(track)
-        config = self._context.config
-        with self._shared.change() as map_:
+        published, closing, config = self.published, self._closing, self._context.config
+        (track,) = published.complete(track)
+        with published.change() as map_:
             track = self._make_room(map_, track)
             certainty = certainty_of(track, config.alignment)
-            keyframe = add_frame(map_, track, certainty, self.reference, predicted=predicted)
+            keyframe = add_frame(map_, track, certainty, published.reference, predicted=predicted)
             map_stereo_points(map_, keyframe, self._context.camera, config)
             refresh_keyframe(map_, keyframe)
             if sees_old_place(map_, keyframe, config.mapping.min_shared):
-                self._closing.count_revisit(map_)
+                closing.count_revisit(map_)
             else:
-                self._closing.adjust_after_revisits(map_)
-            track = self._set_newest(keyframe, track)
-            self.frames.replace(track.index, keyframe)
+                closing.adjust_after_revisits(map_)
+            published.refer_to_new(keyframe, track)
+            track = observe_keyframe(track, map_, keyframe)
             if keyframe > 0:
                 search = partial(
-                    self._closing.search, keyframe=keyframe, features=track.features, image=image
+                    closing.search, keyframe=keyframe, features=track.features, image=image
                 )
-                self._start(partial(self._map_keyframe, keyframe), search)
+                published.start(partial(self._map_keyframe, keyframe), search)
             else:
-                self._closing.process(map_, keyframe, track.features, image)
+                closing.process(map_, keyframe, track.features, image)
         return track
 
     def map_far_points(self, track: Track) -> Track | None:
@@ -81,16 +102,15 @@ class Mapper(PublishedMap):
             The frame with the added landmarks. None if no points were added: the frame is not such
             a keyframe, or another keyframe follows it.
         """
-        (track,) = self.settle(track)
-        with self._shared.change() as map_:
-            keyframe = self.reference
+        published, context = self.published, self._context
+        (track,) = published.complete(track)
+        with published.change() as map_:
+            keyframe = published.reference
             if not has_more_points(map_, keyframe, track):
                 return None
-            new = map_stereo_points(
-                map_, keyframe, self._context.camera, self._context.config, far=True
-            )
+            new = map_stereo_points(map_, keyframe, context.camera, context.config, far=True)
             refresh_keyframe(map_, keyframe)
-            self.refer_to(keyframe)
+            published.refer_to(keyframe)
             return observe_keyframe(track, map_, keyframe) if len(new) else None
 
     def begin(self, start: TwoViewStart) -> Track:
@@ -99,41 +119,42 @@ class Mapper(PublishedMap):
         Returns:
             The second frame with its pose, its velocity and all landmarks of its keyframe.
         """
-        self.settle()
-        with self._shared.change() as map_:
+        published = self.published
+        published.complete()
+        with published.change() as map_:
             second = self._make_room(map_, start.second)
-            keyframes = add_two_views(map_, start, self.reference)
+            keyframes = add_two_views(map_, start, published.reference)
             tracks = start.first, second
             for keyframe, track, image in zip(keyframes, tracks, start.images, strict=True):
                 self._closing.process(map_, keyframe, track.features, image)
-            second = self._set_newest(keyframes[1], second)
-            for keyframe, track in zip(keyframes, tracks, strict=True):
-                self.frames.replace(track.index, keyframe)
-        return replace(second, T_cw=self.frames.pose(second.index), twist=start.twist)
+            published.frames.replace(start.first.index, keyframes[0])
+            published.refer_to_new(keyframes[1], second)
+            second = observe_keyframe(second, map_, keyframes[1])
+        return replace(second, T_cw=published.frames.pose(second.index), twist=start.twist)
 
     def find_old_place(self, track: Track) -> OldPlace | None:
         """Find a place that was mapped some time ago and to which a frame has returned."""
-        return find_old_place(self.map, track, self._context.config.keyframes.known_after_s)
+        known_after_s = self._context.config.keyframes.known_after_s
+        return find_old_place(self.published.map, track, known_after_s)
 
     def use_existing_keyframe(self, place: OldPlace, track: Track) -> None:
         """Make an existing keyframe the reference keyframe instead of inserting a new keyframe."""
-        with self._shared.change() as map_:
+        published = self.published
+        with published.change() as map_:
             certainty = certainty_of(track, self._context.config.alignment)
             new = add_revisit(map_, place.keyframe, track, certainty)
-        self.last_timestamp = track.timestamp
-        self.frames.follow(track.index, place.keyframe, track.T_cw)
-        self._known_place = patches_of_frame(track, map_.scales)
-        self.refer_to(place.keyframe)
+        published.refer_to_known(place.keyframe, track)
         if self._closing.count_reused_keyframe(map_, new=new):
-            self.last_frame = track.index
-            self._start(self._closing.finish)
+            published.start(self._closing.finish)
 
-    def refer_to_nearest(self, track: Track) -> None:
-        """Refer to the keyframe that shares the most landmarks with a frame (ORB-SLAM, V-D)."""
-        shared = count_shared_landmarks(self.map, track)
-        best = int(np.argmax(shared))
-        if shared[best] and best != self.reference:
-            self.refer_to(best)
+    def finish(self, *tracks: Track) -> tuple[Track, ...]:
+        """Complete all running work at the end of a drive, including a global bundle adjustment.
+        Return the moved tracks."""
+        tracks = self.published.complete(*tracks)
+        with self.published.change() as map_:
+            self._closing.conclude(map_)
+            self._closing.finish(map_)
+        return self.published.renew_view(*tracks) if map_.n_keyframes else tracks
 
     def _make_room(self, map_: Map, track: Track) -> Track:
         """Drop culled landmarks if there are many, unless a global bundle adjustment is running.
@@ -146,14 +167,6 @@ class Mapper(PublishedMap):
         landmark[track.landmark >= 0] = new_id[track.tracked]
         return replace(track, landmark=landmark)
 
-    def _set_newest(self, keyframe: int, track: Track) -> Track:
-        map_ = self.map
-        self._patches.remember(track, keyframe, map_.scales)
-        self._known_place = None
-        self.last_frame, self.last_timestamp = track.index, track.timestamp
-        self.refer_to(keyframe)
-        return replace(observe_keyframe(track, map_, keyframe), is_keyframe=True)
-
     def _map_keyframe(self, keyframe: int, map_: Map) -> None:
         map_and_calibrate(map_, keyframe, self._context.camera, self._context.config)
-        self._closing.merge_adjustment_if_due(map_, keyframe)
+        self._closing.apply_adjustment_if_due(map_, keyframe)

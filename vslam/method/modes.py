@@ -11,6 +11,7 @@ from vslam.frontend.keyframes import KeyframeEvidence, KeyframePolicy
 from vslam.frontend.track import By, Images, Prediction, Track
 from vslam.frontend.tracker import Tracker
 from vslam.method.mapping import Mapper
+from vslam.method.published_map import PublishedMap
 from vslam.method.starter import Starter
 from vslam.types.camera import Image
 from vslam.types.context import Context
@@ -78,8 +79,8 @@ class Localising:
     changes_map = False
     due = -1
 
-    def __init__(self, mapper: Mapper) -> None:
-        self._mapper = mapper
+    def __init__(self, published: PublishedMap) -> None:
+        self._published = published
 
     def begin(self, track: Track, image: Image | None) -> Track:
         return track
@@ -89,7 +90,7 @@ class Localising:
 
     def update_map(self, track: Track, images: Images, predicted: Prediction) -> Track:
         if not track.is_lost:
-            self._mapper.refer_to_nearest(track)
+            self._published.refer_to_nearest(track)
         return track
 
     def state(self) -> PolicyState | None:
@@ -116,6 +117,7 @@ class Building:
         self._camera = context.camera
         self._config = context.config
         self._mapper = mapper
+        self._published = mapper.published
         self._tracker = tracker
 
     @property
@@ -136,7 +138,7 @@ class Building:
         start = self.starter.offer(track, image)
         if start is None:
             return track
-        (moved,) = self._mapper.settle(track)
+        (moved,) = self._published.complete(track)
         start = start.at_speed(moved.twist, self._config.initialization.max_rescaling)
         track = self._mapper.begin(start)
         self.starter.reset()
@@ -152,21 +154,21 @@ class Building:
             lost = self._is_lost_for_long(track, predicted)
             return self.begin(track, images.image) if lost else track
         self.starter.reset()
-        self._mapper.count(track)
+        self._published.count(track)
         evidence = self.policy.observe(
             track,
-            self._mapper.view,
-            seconds_since_keyframe=track.timestamp - self._mapper.last_timestamp,
-            mapping_idle=self._mapper.is_published,
+            self._published.view,
+            seconds_since_keyframe=track.timestamp - self._published.last_timestamp,
+            mapping_idle=self._published.is_published,
         )
         if track.by is By.STANDSTILL or self._stays_at_reference(track):
             return track  # only a moving object could show something new
         if not self._is_keyframe(track, evidence):
             return track
-        (track,) = self._mapper.settle(track)
+        (track,) = self._published.complete(track)
         seen: Track | None = track
         if track.by_patches:
-            seen = self._tracker.match_features(track, images, self._mapper.view)
+            seen = self._tracker.match_features(track, images, self._published.view)
         if seen is None or self._use_existing_keyframe(seen):
             return seen or track
         self.policy.reference_renewed()
@@ -175,11 +177,11 @@ class Building:
     def _is_lost_for_long(self, track: Track, predicted: Prediction) -> bool:
         """Return whether a lost frame may begin a sub-map."""
         config, last = self._config.tracking, predicted.last
-        young = self._mapper.n_keyframes <= config.young_keyframes
+        young = self._published.n_keyframes <= config.young_keyframes
         patience = 1 if young else config.lost_frames_before_restart
         if self._camera.monocular:
             patience = config.monocular_lost_frames
-        stood = last is not None and predicted.standstill(self._mapper.view) is not None
+        stood = last is not None and predicted.standstill(self._published.view) is not None
         if last is not None and stood and track.timestamp - last.timestamp < PATIENCE_S:
             return False  # something may be standing or passing in front of the camera
         return predicted.lost_frames + 1 >= patience
@@ -188,7 +190,7 @@ class Building:
         """Return whether the camera has come to rest at its reference keyframe."""
         if track.still is None:
             return False
-        moved = se3_log(orthonormalised(track.T_cw @ inverse(self._mapper.view.T_reference)))
+        moved = se3_log(orthonormalised(track.T_cw @ inverse(self._published.view.T_reference)))
         camera = self._camera
         return bool(
             np.linalg.norm(moved[:3]) < STANDS_M * camera.baseline

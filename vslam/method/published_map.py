@@ -12,16 +12,17 @@ closed before the map is changed again.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 
 import numpy as np
 
 from vslam.backend.disparity_offset import offset_sigma
-from vslam.frontend.patches import RecentPatches, patches_of_landmarks
+from vslam.frontend.patches import RecentPatches, patches_of_frame, patches_of_landmarks
 from vslam.frontend.track import Track
 from vslam.method.closing import LoopClosing, LoopSearch
 from vslam.method.hypotheses import part_of
-from vslam.method.map_frames import LandmarkCounts, MapChange
+from vslam.method.map_frames import LandmarkCounts, MapChange, count_shared_landmarks
 from vslam.method.shared_map import SharedMap
 from vslam.support.workers import Job, Workers
 from vslam.types.context import Context
@@ -43,8 +44,9 @@ class PublishedMap:
     Attributes:
         view: the copy of parts of the map that tracking reads.
         frames: the pose of every frame, relative to a keyframe.
-        last_frame, last_timestamp: index and time (seconds) of the frame that became the last
-            keyframe.
+        last_frame: index of the frame at which the last mapping job started.
+        last_timestamp: time (seconds) of the last frame that became a keyframe or returned to a
+            known place.
         is_published: whether tracking sees the results of all mapping jobs.
     """
 
@@ -92,9 +94,10 @@ class PublishedMap:
         return self.view.reference
 
     @property
-    def has_found_loop(self) -> bool:
-        """Wait for the search for loops. Return whether it found a loop that is not closed yet."""
-        return self._search is not None and self._search.result().loop is not None
+    def is_complete(self) -> bool:
+        """Whether ``complete`` would change nothing. Waits for the search for a loop."""
+        found = self._search is not None and self._search.result().loop is not None
+        return self.is_published and not found
 
     @property
     def is_mapping(self) -> bool:
@@ -106,23 +109,14 @@ class PublishedMap:
         """The map. Raises a RuntimeError if a keyframe is being mapped, or its mapping failed."""
         return self._shared.map
 
-    def keyframe_pose(self, keyframe: int) -> Matrix:
-        """Return the pose ``T_cw`` of a keyframe.
+    def keyframe(self, keyframe: int) -> tuple[Matrix, float]:
+        """Return the pose ``T_cw`` of a keyframe and its unit of length (``KeyframePoses``).
 
-        While a mapping job runs, only the pose of the reference keyframe is available.
+        While a mapping job runs, only those of the reference keyframe are available.
         """
         if not self.is_published and keyframe == self.view.reference:
-            return self.view.T_reference
-        return self.map.keyframe_pose(keyframe)
-
-    def unit_scale(self, keyframe: int) -> float:
-        """Return the factor by which loop closures have scaled lengths near a keyframe.
-
-        While a mapping job runs, only the factor of the reference keyframe is available.
-        """
-        if not self.is_published and keyframe == self.view.reference:
-            return self.view.unit_scale
-        return float(self.map.unit_scale[keyframe])
+            return self.view.T_reference, self.view.unit_scale
+        return self.map.keyframe_pose(keyframe), float(self.map.unit_scale[keyframe])
 
     def trajectory(self) -> Trajectory:
         """Return the pose of every frame (``FramePoses.trajectory``)."""
@@ -136,29 +130,35 @@ class PublishedMap:
 
         Args:
             frame: index of the next frame. Only what is due at this frame is published: the result
-                of the mapping job ``merge_after_frames`` frames after the last keyframe, and a loop
-                that was found there after ten frames. If it is None, the method waits for the
-                mapping job and for the search for loops, but closes no loop.
+                of the mapping job ``publish_after_frames`` frames after the last keyframe, and a
+                loop that was found there after ten frames. If it is None, the result of the mapping
+                job is due, and no loop.
         """
-        if frame is None:
-            tracks = self._publish(tracks)
-            self.wait()
+        if frame is not None:
+            age = frame - self.last_frame
+            if age >= _CLOSE_AFTER_FRAMES:
+                return self.complete(*tracks)
+            if age < self._context.config.keyframes.publish_after_frames:
+                return tracks
+        if self.is_published:
             return tracks
-        age = frame - self.last_frame
-        if age >= self._context.config.keyframes.merge_after_frames:
-            tracks = self._publish(tracks)
-        return self.settle(*tracks) if age >= _CLOSE_AFTER_FRAMES else tracks
+        self._wait_for_mapping()
+        self.is_published = True
+        tracks = self.renew_view(*tracks)
+        self._start_search()
+        return tracks
 
-    def settle(self, *tracks: Track) -> tuple[Track, ...]:
+    def complete(self, *tracks: Track) -> tuple[Track, ...]:
         """Publish the result of the mapping job, close the loop if one was found, and return the
         moved tracks. Every change of the map begins with this."""
         tracks = self.publish(*tracks)
+        self.wait()
         if self._search is None:
             return tracks
         search, self._search = self._search.result(), None
-        with self._shared.change() as map_:
+        with self.change() as map_:
             self._closing.close(map_, search)
-        return self._renew_view(tracks)
+        return self.renew_view(*tracks)
 
     def wait(self) -> Map:
         """Wait for the mapping job and for the search for loops, and return the map.
@@ -172,15 +172,6 @@ class PublishedMap:
             self._search = None
         return map_
 
-    def finish(self, *tracks: Track) -> tuple[Track, ...]:
-        """Complete all running work, including a global bundle adjustment. Return the moved
-        tracks."""
-        tracks = self.settle(*tracks)
-        with self._shared.change() as map_:
-            self._closing.conclude(map_)
-            self._closing.finish(map_)
-        return self._renew_view(tracks) if self.n_keyframes else tracks
-
     def _wait_for_mapping(self) -> Map:
         map_ = self._shared.wait()
         self._counts.write(map_)
@@ -191,16 +182,23 @@ class PublishedMap:
             self._search = self._shared.start_reading(self._next_search)
             self._next_search = None
 
-    def _publish(self, tracks: tuple[Track, ...]) -> tuple[Track, ...]:
-        if self.is_published:
-            return tracks
-        self._wait_for_mapping()
-        self.is_published = True
-        tracks = self._renew_view(tracks)
-        self._start_search()
-        return tracks
+    # Changes
 
-    def _renew_view(self, tracks: tuple[Track, ...]) -> tuple[Track, ...]:
+    def change(self) -> AbstractContextManager[Map]:
+        """Return the map for changes, which begin when everything is complete."""
+        return self._shared.change()
+
+    def start(
+        self, job: Callable[[Map], None], search: Callable[[Map], LoopSearch] | None = None
+    ) -> None:
+        """Start a job that changes the map, and then a search for a loop."""
+        self._shared.start(job)
+        self.last_frame = len(self.frames) - 1
+        self._next_search = search
+        self.is_published = False
+
+    def renew_view(self, *tracks: Track) -> tuple[Track, ...]:
+        """Show tracking the map as it is now, and return the moved tracks."""
         before = self.view
         self.refer_to(before.reference)
         change = MapChange(before, self.view, self.map, self.frames)
@@ -239,10 +237,32 @@ class PublishedMap:
             offset_sigma=offset_sigma(map_.scalars.offset_information, config.stereo),
         )
 
+    def refer_to_new(self, keyframe: int, track: Track) -> None:
+        """Make a new keyframe the reference keyframe. Its frame has been recorded."""
+        self._patches.remember(track, keyframe, self._context.scales)
+        self._known_place = None
+        self.last_frame, self.last_timestamp = track.index, track.timestamp
+        self.refer_to(keyframe)
+        self.frames.replace(track.index, keyframe)
+
+    def refer_to_known(self, keyframe: int, track: Track) -> None:
+        """Make the old keyframe of a known place the reference keyframe of a frame."""
+        self.frames.follow(track.index, keyframe, track.T_cw)
+        self._known_place = patches_of_frame(track, self._context.scales)
+        self.last_timestamp = track.timestamp
+        self.refer_to(keyframe)
+
+    def refer_to_nearest(self, track: Track) -> None:
+        """Refer to the keyframe that shares the most landmarks with a frame (ORB-SLAM, V-D)."""
+        shared = count_shared_landmarks(self.map, track)
+        best = int(np.argmax(shared))
+        if shared[best] and best != self.reference:
+            self.refer_to(best)
+
     # State for checkpoints
 
     def state(self) -> MapperState:
-        """Return the state of the mapper for a checkpoint, without the map."""
+        """Return the state for a checkpoint, without the map."""
         return MapperState(
             self.reference,
             self.last_frame,
@@ -265,11 +285,3 @@ class PublishedMap:
         if map_.n_keyframes and map_.sessions[newest] == map_.scalars.session:
             self.last_frame = int(map_.frames[newest])
             self.last_timestamp = float(map_.timestamps[newest])
-
-    def _start(
-        self, job: Callable[[Map], None], search: Callable[[Map], LoopSearch] | None = None
-    ) -> None:
-        """Start a job that changes the map, and then a search for a loop."""
-        self._shared.start(job)
-        self._next_search = search
-        self.is_published = False

@@ -109,7 +109,7 @@ class Session:
 
     Attributes:
         closing: finds and closes loops.
-        mapper: owns the map.
+        published: the map, and what tracking sees of it.
         rig: what the images tell about the stereo rig.
         last: the last frame that was tracked. None before the first one.
         opened: the map in which the drive began.
@@ -144,15 +144,18 @@ class Session:
             detector, verifier, camera, config, threads=workers.threads
         )
         self.opened = opened = open_map(start, context, closing, localize=localize, resume=resume)
-        self.mapper = mapper = Mapper(context, closing, workers, opened.map, opened.frames)
+        self._mapper = mapper = Mapper(context, closing, workers, opened.map, opened.frames)
+        self.published = mapper.published
         self.rig = RigMonitor()
         self.last: Track | None = None
         self._context = context
         recognise = LearnedRelocalisation(images, camera, config)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)
-        self._motion = Motion(context, mapper.frames)
+        self._motion = Motion(context, self.published.frames)
         self._tracker = tracker = Tracker(context)
-        self._mode: Mode = Localising(mapper) if localize else Building(context, mapper, tracker)
+        self._mode: Mode = (
+            Localising(self.published) if localize else Building(context, mapper, tracker)
+        )
         if opened.frames is not None:
             self._resume(opened.frames)
 
@@ -168,8 +171,8 @@ class Session:
         clock = StageClock(dict(stage_ms or {}))
         self._publish_due()
         clock.lap("wait_for_mapping")
-        predicted = self._motion.predict(timestamp, self.last, self.mapper.view)
-        if not self.mapper.n_keyframes:
+        predicted = self._motion.predict(timestamp, self.last, self.published.view)
+        if not self.published.n_keyframes:
             return self._begin(images, predicted, clock, on_pose)
         track, predicted = self._track(images, predicted, clock)
         track = self._record(track, predicted)
@@ -182,17 +185,17 @@ class Session:
     def skip(self, timestamp: float, *, dropped: bool) -> TrackResult:
         """Add a frame without images at the predicted pose. Its state is LOST or DROPPED."""
         self._check(timestamp)
-        predicted = self._motion.predict(timestamp, self.last, self.mapper.view)
+        predicted = self._motion.predict(timestamp, self.last, self.published.view)
         state = TrackingState.DROPPED if dropped else TrackingState.LOST
         return self._result(self._record(replace(predicted.lost, state=state), predicted), {})
 
     def finish(self) -> None:
         """Complete all mapping."""
-        moved = self.mapper.finish(*self._held)
+        moved = self._mapper.finish(*self._held)
         self.last = moved[0] if moved else None
 
     def _check(self, timestamp: float) -> None:
-        frames = self.mapper.frames
+        frames = self.published.frames
         if not math.isfinite(timestamp):
             raise ValueError(f"timestamp {timestamp} s must be a finite number")
         if len(frames) and not timestamp > (last := frames.timestamp(-1)):
@@ -205,7 +208,7 @@ class Session:
 
     def _publish_due(self) -> None:
         """Publish what is due at the next frame. The last frame moves with the map."""
-        moved = self.mapper.publish(*self._held, frame=len(self.mapper.frames))
+        moved = self.published.publish(*self._held, frame=len(self.published.frames))
         self.last = moved[0] if moved else None
 
     def _begin(
@@ -216,7 +219,7 @@ class Session:
         on_pose: Callable[[TrackResult], None],
     ) -> TrackResult:
         """Try to begin the map with a frame."""
-        track = self._tracker.extract(images, predicted, self.mapper.view)
+        track = self._tracker.extract(images, predicted, self.published.view)
         clock.lap("extract")
         track = self._mode.begin(self._record(track, predicted), images.image)
         n = len(track.tracked)
@@ -233,18 +236,18 @@ class Session:
         Returns:
             The frame, and the prediction, which may have changed together with the map.
         """
-        mapper, tracker = self.mapper, self._tracker
-        track = tracker.track(images, predicted, mapper.view, clock)
+        published, tracker = self.published, self._tracker
+        track = tracker.track(images, predicted, published.view, clock)
         if track.is_lost and (last := self._mode.map_far_points(predicted.last)) is not None:
-            predicted = self._motion.predict(predicted.timestamp, last, mapper.view)
-            track = tracker.track(images, predicted, mapper.view, clock)
-        seen = predicted.last_seen(mapper.view)
+            predicted = self._motion.predict(predicted.timestamp, last, published.view)
+            track = tracker.track(images, predicted, published.view, clock)
+        seen = predicted.last_seen(published.view)
         if track.is_doubtful and predicted.last is not None:
             # It is worth waiting for the map: a doubtful frame soon becomes a keyframe.
-            track, last = mapper.publish(track, predicted.last)
+            track, last = published.publish(track, predicted.last)
             predicted = replace(predicted, last=last)
-        if track.is_doubtful or (track.is_lost and mapper.is_published):
-            track = self._relocaliser.check(track, images, mapper.wait(), seen)
+        if track.is_doubtful or (track.is_lost and published.is_published):
+            track = self._relocaliser.check(track, images, published.wait(), seen)
             clock.lap("relocalise")
         return track, predicted
 
@@ -254,8 +257,8 @@ class Session:
         Returns:
             The frame with its velocity.
         """
-        track = self._motion.advance(track, predicted, self.mapper.view)
-        self.mapper.record(track)
+        track = self._motion.advance(track, predicted, self.published.view)
+        self.published.record(track)
         self.last = predicted.last if track.is_lost else track
         return track
 
@@ -287,7 +290,7 @@ class Session:
             stage_ms=stage_ms,
             T_odom_camera=odometry.T_odom_camera,
             uncertainty=odometry.now,
-            part=self.mapper.view.part,
+            part=self.published.view.part,
             support=track.support,
             stands_still=track.by is By.STANDSTILL,
         )
@@ -302,7 +305,7 @@ class Session:
         Args:
             drive: source of the images of the current drive, such as "kitti 06".
         """
-        map_, closing, opened = self.mapper.wait(), self.closing, self.opened
+        map_, closing, opened = self.published.wait(), self.closing, self.opened
         images = closing.verifier.images
         return StoredMap(
             map=map_,
@@ -310,7 +313,7 @@ class Session:
             loops=tuple(closing.closed),
             detector=closing.detector.memory(),
             images=None if images is None else images.files(map_.n_keyframes),
-            frames=self.mapper.frames.table(),
+            frames=self.published.frames.table(),
             drives=(*opened.drives, drive) if self._mode.changes_map else opened.drives,
             thresholds=changed_thresholds(self._context.config.model_dump()),
             truth_alignment=opened.truth_alignment,
@@ -324,14 +327,14 @@ class Session:
         also not possible while a keyframe is being mapped, a monocular map begins, a verified loop
         is waiting to be closed, or a global bundle adjustment is running.
         """
-        policy, mapper = self._mode.state(), self.mapper
+        policy, published = self._mode.state(), self.published
         if self.last is None or policy is None:
             return None
-        if self.closing.is_adjusting or not mapper.is_published or mapper.has_found_loop:
+        if self.closing.is_adjusting or not published.is_complete:
             return None
         return Checkpoint(
             tracker_state(self.last, self._motion.lost_frames),
-            mapper.state(),
+            published.state(),
             policy,
             self.closing.state(),
             self.rig.sides,
@@ -345,33 +348,33 @@ class Session:
 
     def _resume(self, frames: FrameTable) -> None:
         if len(frames.timestamp):
-            self.mapper.continue_drive()
+            self.published.continue_drive()
             self._motion.resume()
         if self.opened.checkpoint is not None:
             self._restore(self.opened.checkpoint)
             return
-        if self.mapper.n_keyframes:
+        if self.published.n_keyframes:
             _log.warning(
                 "the map was saved without the state of tracking (resumable=True), so the poses of "
                 "the continued drive will differ from those of an uninterrupted one"
             )
         if len(frames.tracked) > 1 and frames.tracked[-2:].all():
-            self.mapper.refer_to(int(frames.reference[-1]))
-            poses = self.mapper.frames
+            self.published.refer_to(int(frames.reference[-1]))
+            poses = self.published.frames
             step = se3_log(orthonormalised(poses.pose(-1) @ inverse(poses.pose(-2))))
             self._motion.resume(step / (frames.timestamp[-1] - frames.timestamp[-2]))
 
     def _restore(self, state: Checkpoint) -> None:
         """Restore the state of all parts, given the map that was stored together with it."""
-        self.mapper.restore(state.mapper)
+        self.published.restore(state.mapper)
         self._mode.restore(state.policy)
         self.closing.restore(state.closing)
         self.rig = RigMonitor(state.sides)
         self._motion.restore(state.odometry, state.tracker.lost_frames)
         last = restored_track(state.tracker, self._context)
-        offset = self.mapper.view.disparity_offset  # it was corrected before it was saved
+        offset = self.published.view.disparity_offset  # it was corrected before it was saved
         extracted = replace(last.extracted, disparity_offset=offset)
-        positions = self.mapper.map.arrays.xyz[last.landmark]
+        positions = self.published.map.arrays.xyz[last.landmark]
         xyz = np.where((last.landmark >= 0)[:, None], positions, np.nan)
         self.last = replace(last, extracted=extracted, xyz=xyz)
 

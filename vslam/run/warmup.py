@@ -47,7 +47,7 @@ from vslam.backend import (
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.fusion import fuse_loop
 from vslam.backend.global_bundle_adjustment import adjust_globally
-from vslam.backend.global_mapping import merge_solution, take_snapshot
+from vslam.backend.global_mapping import apply_solution, take_snapshot
 from vslam.backend.loop_correction import move_keyframes
 from vslam.backend.pose_graph import check_pose_graph, essential_graph, load_optimiser
 from vslam.config import Config, DepthConfig, KeyframeConfig, MappingConfig, TrackingConfig
@@ -171,7 +171,7 @@ def run_everything() -> None:
     Each image becomes a keyframe. Therefore, the run calls all kernels of tracking, triangulation,
     fusion and bundle adjustment.
     """
-    every_frame = KeyframeConfig(max_interval_s=0.05, merge_after_frames=1)
+    every_frame = KeyframeConfig(max_interval_s=0.05, publish_after_frames=1)
     run_slam(Config(keyframes=every_frame, tracking=_FEATURES), FRAMES)
     compile_patches()
     decode_image()
@@ -266,10 +266,10 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
         )
         seen = Track(k, 0.1 * k, T_cw, state=TrackingState.OK).with_features(Extracted(features))
         track = replace(seen, landmark=landmark)
-        mapper.record(track)
-        (track,) = mapper.publish(mapper.insert(track, None))
+        mapper.published.record(track)
+        (track,) = mapper.published.complete(mapper.insert(track, None))
         landmark = track.landmark
-    return mapper.map, features
+    return mapper.published.map, features
 
 
 def compile_recognition() -> None:
@@ -314,7 +314,7 @@ def compile_correction() -> None:
     move_keyframes(map_, graph.keyframes, graph.T_cw)
     fuse_loop(map_, edge, [2], [0], CAMERA, config)
     snapshot = take_snapshot(map_, CAMERA)
-    merge_solution(map_, snapshot, adjust_globally(snapshot.problem, iterations=1))
+    apply_solution(map_, snapshot, adjust_globally(snapshot.problem, iterations=1))
 
 
 def smallest_vocabulary() -> Vocabulary:

@@ -28,15 +28,9 @@ class KeyframePoses(Protocol):
     @property
     def reference(self) -> int: ...
 
-    def keyframe_pose(self, keyframe: int) -> Matrix:
-        """Return the pose ``T_cw`` of a keyframe."""
-        ...
-
-    def unit_scale(self, keyframe: int) -> float:
-        """Return the factor by which loop closures have scaled lengths near a keyframe.
-
-        It is 1 in metric maps.
-        """
+    def keyframe(self, keyframe: int) -> tuple[Matrix, float]:
+        """Return the pose ``T_cw`` of a keyframe, and the factor by which loop closures have scaled
+        lengths near it. The factor is 1 in metric maps."""
         ...
 
 
@@ -49,8 +43,8 @@ class FrameTable(NamedTuple):
         T_c_reference: ``(N, 4, 4)`` float64, maps points from the camera of the keyframe to the
             camera of the frame.
         tracked: ``(N,)`` bool, False where the pose is only predicted.
-        unit_scale: ``(N,)`` float64, ``KeyframePoses.unit_scale`` of the keyframe at the time when
-            ``T_c_reference`` was measured.
+        unit_scale: ``(N,)`` float64, the factor of the keyframe (``KeyframePoses.keyframe``) at the
+            time when ``T_c_reference`` was measured.
     """
 
     timestamp: NDArray[np.float64]
@@ -128,15 +122,15 @@ class FramePoses:
 
     def replace(self, index: int, keyframe: int) -> None:
         """Set the pose of a frame that became a keyframe to the pose of that keyframe."""
-        unit = self._keyframes.unit_scale(keyframe)
+        _, unit = self._keyframes.keyframe(keyframe)
         self._frames.tracked[self._number(index)] = True
         self._set(index, keyframe, np.eye(4), unit)
 
     def follow(self, index: int, keyframe: int, T_cw: Matrix) -> None:
         """Store the pose ``T_cw`` of a frame relative to a keyframe."""
-        keyframes, T_kw, unit = self._keyframes, np.eye(4), 1.0
-        if keyframes.n_keyframes:
-            T_kw, unit = keyframes.keyframe_pose(keyframe), keyframes.unit_scale(keyframe)
+        T_kw, unit = np.eye(4), 1.0
+        if self._keyframes.n_keyframes:
+            T_kw, unit = self._keyframes.keyframe(keyframe)
         self._set(index, keyframe, orthonormalised(T_cw @ inverse(T_kw)), unit)
 
     def _set(self, index: int, reference: int, T_c_reference: Matrix, unit: float) -> None:
@@ -159,11 +153,10 @@ class FramePoses:
         T_c_reference = self._frames.T_c_reference[index].copy()
         if self._keyframes.n_keyframes == 0:
             return T_c_reference
-        reference = int(self._frames.reference[index])
-        unit, measured = self._keyframes.unit_scale(reference), self._frames.unit_scale[index]
-        if unit != measured:
-            T_c_reference[:3, 3] *= unit / measured
-        return T_c_reference @ self._keyframes.keyframe_pose(reference)
+        T_kw, unit = self._keyframes.keyframe(int(self._frames.reference[index]))
+        if unit != self._frames.unit_scale[index]:
+            T_c_reference[:3, 3] *= unit / self._frames.unit_scale[index]
+        return T_c_reference @ T_kw
 
     def trajectory(self) -> Trajectory:
         """Return the pose of every frame.

@@ -6,7 +6,7 @@ list, in which ``next_row`` is the next row. Covisibility is not stored. It is c
 when it is needed. The use of arrays instead of objects follows DPVO's PatchGraph.
 
 Culled keyframes and landmarks stay in the arrays and are marked as culled. A landmark that was
-merged into another landmark counts as culled. Ids of keyframes are never reused. Ids of landmarks
+fused with another landmark counts as culled. Ids of keyframes are never reused. Ids of landmarks
 change only when culled landmarks are dropped.
 
 Each array is called a column. To add a column, declare it in ``Arrays`` or ``KeyframeTable`` with
@@ -53,8 +53,8 @@ class Arrays(NamedTuple):
         first_keyframe: ``(L,)`` i4, the first keyframe that observed the landmark.
         visible: ``(L,)`` i4, number of frames in which the landmark was expected to be visible.
         found: ``(L,)`` i4, number of frames in which the landmark was found.
-        landmark_alive: ``(L,)`` bool, False for a culled or merged landmark.
-        merged_into: ``(L,)`` i4, the landmark that this landmark was merged into.
+        landmark_alive: ``(L,)`` bool, False for a culled or fused landmark.
+        fused_into: ``(L,)`` i4, the landmark that this landmark was fused with.
         head: ``(L,)`` i4, index of the first keypoint that observes the landmark.
         n_observations: ``(L,)`` i4, number of observations. A stereo observation counts twice
             (ORB-SLAM2).
@@ -82,7 +82,7 @@ class Arrays(NamedTuple):
     visible: NDArray[np.int32] = np.zeros(0, np.int32)
     found: NDArray[np.int32] = np.zeros(0, np.int32)
     landmark_alive: NDArray[np.bool_] = np.zeros(0, np.bool_)
-    merged_into: NDArray[np.int32] = np.zeros(0, np.int32)
+    fused_into: NDArray[np.int32] = np.zeros(0, np.int32)
     head: NDArray[np.int32] = np.zeros(0, np.int32)
     n_observations: NDArray[np.int32] = np.zeros(0, np.int32)
     xy: NDArray[np.float32] = np.zeros((0, 2), np.float32)
@@ -294,7 +294,7 @@ class Map:
         a.first_keyframe[new] = keyframe
         a.visible[new], a.found[new] = 1, 1
         a.landmark_alive[new] = True
-        a.merged_into[new], a.head[new] = NONE, NONE
+        a.fused_into[new], a.head[new] = NONE, NONE
         a.n_observations[new] = 0
         self.n_landmarks += n
         return np.arange(start, start + n, dtype=np.int32)
@@ -346,7 +346,7 @@ class Map:
 
         Returns:
             ``(n_landmarks,)`` new id of each old landmark, or -1 if it was culled. A landmark that
-            was merged into another landmark has the new id of that landmark (``resolve``).
+            was fused with another landmark has the new id of that landmark (``resolve``).
         """
         a, living = self.arrays, self.living_landmarks()
         resolved = resolve(a, np.arange(self.n_landmarks, dtype=np.int32))
@@ -437,7 +437,7 @@ class Map:
         return np.flatnonzero(self.arrays.keyframe_alive[: self.n_keyframes])
 
     def living_landmarks(self) -> NDArray[np.int64]:
-        """Return the ids of the landmarks that were not culled or merged into another landmark."""
+        """Return the ids of the landmarks that were not culled or fused with another landmark."""
         return np.flatnonzero(self.arrays.landmark_alive[: self.n_landmarks])
 
 

@@ -120,7 +120,7 @@ def observed_by(a, landmark, keyframe):
 
 
 @kernel
-def merge_landmarks(a, loser, winner):
+def fuse_landmarks(a, loser, winner):
     """Move the observations of landmark ``loser`` to landmark ``winner``.
 
     A keyframe that observes both landmarks keeps only its observation of ``winner``.
@@ -138,24 +138,24 @@ def merge_landmarks(a, loser, winner):
     a.head[loser] = -1
     a.n_observations[loser] = 0
     a.landmark_alive[loser] = False
-    a.merged_into[loser] = winner
+    a.fused_into[loser] = winner
     a.visible[winner] += a.visible[loser]
     a.found[winner] += a.found[loser]
 
 
 @kernel
 def resolve(a, landmarks):
-    """Return the current ids of landmarks that may have been merged or culled.
+    """Return the current ids of landmarks that may have been fused or culled.
 
     Returns:
-        ``(N,)`` int32. For a merged landmark, this is the id of the landmark that it was merged
-        into. For a culled landmark, it is -1. Other landmarks keep their ids.
+        ``(N,)`` int32. For a fused landmark, this is the id of the landmark that it was fused
+        with. For a culled landmark, it is -1. Other landmarks keep their ids.
     """
     out = np.empty(len(landmarks), np.int32)
     for i in range(len(landmarks)):
         landmark = landmarks[i]
         while landmark >= 0 and not a.landmark_alive[landmark]:
-            landmark = a.merged_into[landmark]
+            landmark = a.fused_into[landmark]
         out[i] = landmark
     return out
 

@@ -82,7 +82,7 @@ class Revisits:
     def observing(self, landmark: NDArray[np.int32]) -> Revisits:
         """Return the revisits with ``(O,)`` new landmarks.
 
-        If a revisit then observes a landmark twice, because two landmarks were merged, only its
+        If a revisit then observes a landmark twice, because two landmarks were fused, only its
         first observation keeps the landmark.
         """
         revisit = np.repeat(np.arange(len(self)), np.diff(self.first))

@@ -1,9 +1,9 @@
-"""Merging of the maps of several drives. Loop closures between the maps join them.
+"""Joins the maps of several drives by loop closures between them.
 
 Each of the other maps is appended to the first map as a sub-map at an unknown place. For each
 keyframe of the appended map, the detector of the first map proposes loop candidates. These
 candidates are verified and closed as in a run. The first loop moves the sub-map to its place. Later
-loops correct drift and fuse landmarks. At the end, a global bundle adjustment optimises the merged
+loops correct drift and fuse landmarks. At the end, a global bundle adjustment optimises the joined
 map.
 """
 
@@ -29,8 +29,8 @@ Memory = tuple[LoopDetector, KeyframeImages | None]
 
 
 @dataclass(frozen=True)
-class MergedMaps:
-    """The result of merging several maps. A map is identified by its index in the input.
+class JoinedMaps:
+    """The result of joining several maps. A map is identified by its index in the input.
 
     Attributes:
         stored: the first map, together with all maps that were joined to it.
@@ -45,12 +45,12 @@ class MergedMaps:
     loops: dict[int, list[LoopEdge]]
 
 
-def merge_maps(
+def join_maps(
     maps: Sequence[StoredMap],
     config: Config,
     create: Callable[[], Memory],
     on_keyframe: Callable[[], None] = lambda: None,
-) -> MergedMaps:
+) -> JoinedMaps:
     """Join maps to the first map.
 
     A map need not overlap the first map if it overlaps another map. Such a map is joined after the
@@ -63,7 +63,7 @@ def merge_maps(
         on_keyframe: function that is called after the search for loops at each keyframe.
 
     Raises:
-        ValueError: the maps cannot be merged. The message gives the reason in a few words.
+        ValueError: the maps cannot be joined. The message gives the reason in a few words.
     """
     whole, waiting = maps[0].compact(), dict(enumerate(maps))
     del waiting[0]
@@ -81,7 +81,7 @@ def merge_maps(
                 joined.append(number)
                 del waiting[number]
                 progress = True
-    return MergedMaps(whole, joined, list(waiting), loops)
+    return JoinedMaps(whole, joined, list(waiting), loops)
 
 
 def join(

@@ -1,4 +1,4 @@
-"""Maps of several drives are merged into one map, and parts of maps are extracted."""
+"""Maps of several drives are joined to one map, and parts of maps are extracted."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vslam.config import Config
 from vslam.loopclosure.registry import create_detector
 from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap, appended, in_box, near_frames, near_point
-from vslam.method.merging import merge_maps
+from vslam.method.joining import join_maps
 from vslam.slam import Slam
 from vslam.support.errors import InputError
 from vslam.types.camera import Camera
@@ -110,13 +110,13 @@ def test_images_are_kept_if_only_one_map_has_them(drives, with_images, tmp_path)
 
 def test_drives_that_meet_become_one_map(drives, ring, check_map, tmp_path):
     """The first and the second drive are connected only through the third drive."""
-    merged = merge_maps(drives, CONFIG, create)
-    assert merged.joined == [2, 1]
-    assert merged.left_out == []
-    map_ = merged.stored.map
+    joined = join_maps(drives, CONFIG, create)
+    assert joined.joined == [2, 1]
+    assert joined.left_out == []
+    map_ = joined.stored.map
     check_map(map_)
     assert map_.n_keyframes == sum(drive.map.n_keyframes for drive in drives)
-    assert merged.stored.drives == ("ring 0", "ring 55", "ring 110")
+    assert joined.stored.drives == ("ring 0", "ring 55", "ring 110")
     alone = np.concatenate(
         [
             errors(drive.map, ring, [start])
@@ -131,8 +131,8 @@ def test_drives_that_meet_become_one_map(drives, ring, check_map, tmp_path):
     assert any({0, 1} <= seen | {sessions[k]} for k, seen in enumerate(shared))
     assert any({1, 2} <= seen | {sessions[k]} for k, seen in enumerate(shared))
 
-    # In the merged map, a camera can be relocalised in all three parts.
-    save_map(tmp_path / "town.npz", merged.stored)
+    # In the joined map, a camera can be relocalised in all three parts.
+    save_map(tmp_path / "town.npz", joined.stored)
     for place in (10, 90, 170):
         slam = Slam.load(tmp_path / "town.npz", threads=1, localize=True)
         assert slam.step_features(Extracted(ring.see(place, seed=7)), 0.0).relocalised
@@ -142,31 +142,31 @@ def test_drives_that_meet_become_one_map(drives, ring, check_map, tmp_path):
 
 def test_the_same_maps_give_the_same_map(drives, tmp_path):
     for name in ("a", "b"):
-        save_map(tmp_path / name, merge_maps(drives[::2], CONFIG, create).stored)
+        save_map(tmp_path / name, join_maps(drives[::2], CONFIG, create).stored)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_a_map_of_another_place_is_left_out(drives, elsewhere):
-    merged = merge_maps([drives[0], elsewhere, drives[2]], CONFIG, create)
-    assert merged.joined == [2]
-    assert merged.left_out == [1]
-    assert set(merged.stored.map.sessions) == {0, 1}
+    joined = join_maps([drives[0], elsewhere, drives[2]], CONFIG, create)
+    assert joined.joined == [2]
+    assert joined.left_out == [1]
+    assert set(joined.stored.map.sessions) == {0, 1}
 
 
-def test_a_merged_map_is_merged_again(drives, ring):
-    first = merge_maps([drives[0], drives[2]], CONFIG, create).stored
-    merged = merge_maps([first, drives[1]], CONFIG, create)
-    assert merged.joined == [1]
-    assert errors(merged.stored.map, ring, [0, 55, 110]).max() < 1.0
-    assert len(merged.stored.loops) > len(first.loops)
+def test_a_joined_map_is_joined_again(drives, ring):
+    first = join_maps([drives[0], drives[2]], CONFIG, create).stored
+    joined = join_maps([first, drives[1]], CONFIG, create)
+    assert joined.joined == [1]
+    assert errors(joined.stored.map, ring, [0, 55, 110]).max() < 1.0
+    assert len(joined.stored.loops) > len(first.loops)
 
 
 def test_maps_of_another_camera_or_detector_are_refused(drives):
     camera = Camera(400.0, 400.0, 400.0, 150.0, 0.5, 800, 300)
     with pytest.raises(ValueError, match="another camera"):
-        merge_maps([drives[0], StoredMap(drives[1].map, camera)], CONFIG, create)
+        join_maps([drives[0], StoredMap(drives[1].map, camera)], CONFIG, create)
     with pytest.raises(ValueError, match="the detector none, not bow"):
-        merge_maps([drives[0], StoredMap(drives[1].map, CAMERA)], CONFIG, create)
+        join_maps([drives[0], StoredMap(drives[1].map, CAMERA)], CONFIG, create)
 
 
 # -- crop -----------------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ def test_merge_names_what_meets_and_what_does_not(files, tmp_path):
     assert line.startswith(f"{files[3]}: left out")
 
 
-def test_maps_are_merged_with_the_thresholds_of_the_first(drives, tmp_path):
+def test_maps_are_joined_with_the_thresholds_of_the_first(drives, tmp_path):
     strict = {"verification.min_inliers": 100_000}
     for name, stored in (
         ("usual", drives[0]),
@@ -245,19 +245,19 @@ def test_maps_are_merged_with_the_thresholds_of_the_first(drives, tmp_path):
     assert "other thresholds" not in result.output
 
 
-def test_a_merged_map_is_exported(drives, tmp_path):
-    merged = merge_maps([drives[0], drives[2]], CONFIG, create).stored
-    save_map(tmp_path / "town.npz", merged)
+def test_a_joined_map_is_exported(drives, tmp_path):
+    joined = join_maps([drives[0], drives[2]], CONFIG, create).stored
+    save_map(tmp_path / "town.npz", joined)
     for words in (("g2o",), ("ply", "--no-colours")):
         result = run("export", words[0], tmp_path / "town.npz", *words[1:])
         assert result.exit_code == 0, result.output
     text = (tmp_path / "town.g2o").read_text()
     lines = text.splitlines()
     ids = [line.split()[1] for line in lines if line.startswith("VERTEX")]
-    assert ids == [str(k) for k in range(merged.map.n_keyframes)]
+    assert ids == [str(k) for k in range(joined.map.n_keyframes)]
     assert (tmp_path / "town.ply").stat().st_size > 0
     # The edges are weighted by the thresholds with which the map was made.
-    drifting = replace(merged, thresholds={"pose_graph.rotation_drift": 0.1})
+    drifting = replace(joined, thresholds={"pose_graph.rotation_drift": 0.1})
     save_map(tmp_path / "drifting.npz", drifting)
     result = run("export", "g2o", tmp_path / "drifting.npz")
     assert result.exit_code == 0, result.output

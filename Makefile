@@ -77,7 +77,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	    echo "$$python has no venv module: install it (Debian, Ubuntu: python3-venv)" >&2; exit 1; }; \
 	fi
 	@echo 'Installing vslam into $(VENV): a minute or two'
-	@$(BIN)/python -m pip install --quiet -e . -c constraints.txt
+	@$(BIN)/python -m pip install --quiet --no-compile -e . -c constraints.txt
 	@touch $@
 
 $(DEVELOPED): $(INSTALLED)
@@ -89,5 +89,5 @@ $(DEVELOPED): $(INSTALLED)
 	    echo "$(TORCH_INDEX) does not answer: torch comes from PyPI, with gigabytes of CUDA" >&2; \
 	fi
 	@echo 'Installing torch and the tools of development into $(VENV): a few minutes'
-	@$(BIN)/python -m pip install --quiet -e '.[dev]' -c constraints.txt
+	@$(BIN)/python -m pip install --quiet --no-compile -e '.[dev]' -c constraints.txt
 	@touch $@

@@ -28,6 +28,9 @@ from vslam.types.features import shifted_columns
 from vslam.types.map import Map
 from vslam.types.map_kernels import collect_landmarks
 
+# The offset is estimated again after this many keyframes. [own]
+_OFFSET_KEYFRAMES = 12
+
 STEP = 0.2  # pixels between the three offsets for which the cost is computed
 ITERATIONS = 15
 # Variance of the error of the estimate, in multiples of the inverse of its information. It is not
@@ -39,7 +42,7 @@ TOLERANCE = 1e-5  # least relative decrease of the cost; STEP changes it by some
 
 def map_and_calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Run local mapping for a new keyframe (``map_keyframe``). For a stereo camera, the disparity
-    offset of the map is updated after every ``stereo.offset_keyframes`` keyframes."""
+    offset of the map is updated after every ``_OFFSET_KEYFRAMES`` keyframes."""
     map_keyframe(map_, keyframe, camera, config)
     if config.stereo.offset_sigma > 0.0 and camera.sensor == "stereo":
         _calibrate(map_, keyframe, camera, config)
@@ -48,7 +51,7 @@ def map_and_calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) 
 def _calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     known, window = map_.scalars, map_.living_keyframes()
     window = window[window > max([known.calibrated_until, *(k - 1 for k in map_.restarts)])]
-    if len(window) < config.stereo.offset_keyframes:
+    if len(window) < _OFFSET_KEYFRAMES:
         return
     map_.scalars = replace(known, calibrated_until=keyframe)
     landmarks = collect_landmarks(map_.arrays, window, map_.n_landmarks)

@@ -21,6 +21,12 @@ from vslam.types.map_kernels import (
 )
 from vslam.types.reprojection import chi_square_ratio, unpacked
 
+# Duplicate landmarks of a new keyframe and of this many covisible keyframes are fused. [OS1 VI-C,
+# customary]
+_FUSE_NEIGHBOURS = 10
+# Search radius for duplicate landmarks, in pixels at octave 0. [OS1 VI-C, customary]
+_FUSE_WINDOW = 3.0
+
 
 def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Fuse the landmarks of a keyframe with the landmarks of its neighbours.
@@ -30,23 +36,23 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
     landmark, the two landmarks are fused. If the feature has no landmark, it becomes an
     observation of the projected landmark.
     """
-    neighbours = fusion_neighbours(map_, keyframe, config)
+    neighbours = fusion_neighbours(map_, keyframe)
     for neighbour in neighbours:
         fuse_into(map_, map_.landmarks_of(keyframe), neighbour, camera, config)
     landmarks = collect_landmarks(map_.arrays, np.array(neighbours, np.int64), map_.n_landmarks)
     fuse_into(map_, landmarks, keyframe, camera, config)
 
 
-def fusion_neighbours(map_: Map, keyframe: int, config: Config) -> list[int]:
+def fusion_neighbours(map_: Map, keyframe: int) -> list[int]:
     """Return the ids of the keyframes whose landmarks are fused with the landmarks of a keyframe
     (ORB-SLAM2).
 
-    First, they are the ``mapping.fuse_neighbours`` keyframes that share the most landmarks with the
+    First, they are the ``_FUSE_NEIGHBOURS`` keyframes that share the most landmarks with the
     keyframe. For each of these keyframes, the five keyframes that share the most landmarks with it
     are added.
     """
     first, _ = map_.covisible(keyframe)
-    chosen = first[: config.mapping.fuse_neighbours].tolist()
+    chosen = first[:_FUSE_NEIGHBOURS].tolist()
     known = {keyframe, *chosen}
     for neighbour in list(chosen):
         second, _ = map_.covisible(neighbour)
@@ -120,7 +126,7 @@ def fuse_into(
         camera.width,
         camera.height,
         map_.scales,
-        config.mapping.fuse_window,
+        _FUSE_WINDOW,
         config.mapping.fuse_distance,
     )
 

@@ -166,7 +166,7 @@ def anchor(
         factors = _factors(
             graph, seconds, T_enu_k, scale, positions, config, cauchy=width, stretch=stretch
         )
-        T_enu_k = _optimised(factors, config)
+        T_enu_k = _optimised(factors)
         if not metric:
             scale = _local_scale(T_wk, T_enu_k, scale, part)
     used = np.ones(len(positions.seconds), np.bool_)
@@ -176,7 +176,7 @@ def anchor(
         used = chi2 <= GATE * max(1.0, float(np.median(chi2)) / _MEDIAN)
         chosen = positions.select(used)
         final = partial(_factors, graph, seconds, T_enu_k, scale, chosen, config)
-        T_enu_k = _likeliest(final, part, config) if metric else _optimised(final(), config)
+        T_enu_k = _likeliest(final, part) if metric else _optimised(final())
     distance = np.linalg.norm(_residuals(positions, T_enu_k, scale)[used], axis=1)
     residual = float(np.sqrt(np.mean(distance**2)))
     return Anchored(T_enu_k, scale, used, residual, main.S_enu_w, main.unsure_about <= _MAX_UNSURE)
@@ -326,9 +326,7 @@ def _local_scale(T_wk: Array, T_enu_k: Array, scale: Array, part: NDArray[np.int
     return scale
 
 
-def _likeliest(
-    factors: Callable[..., _Factors], part: NDArray[np.int64], config: PoseGraphConfig
-) -> Array:
+def _likeliest(factors: Callable[..., _Factors], part: NDArray[np.int64]) -> Array:
     """Optimise the poses with each factor of the drift model in ``_DRIFTS``. Returns the ``(N, 4,
     4)`` poses for the factor that maximises the likelihood of the fixes, given the edges.
 
@@ -347,7 +345,7 @@ def _likeliest(
     for drift in _DRIFTS:
         found = factors(drift=drift)
         vision, both = found.vision, found.both()
-        result = minimised(both, found.start, config)
+        result = minimised(both, found.start)
         after = _log_determinant(both, result)
         # Vision alone does not determine where each part of the map is, so each part is held.
         for i in np.unique(part, return_index=True)[1].tolist():
@@ -355,7 +353,7 @@ def _likeliest(
         surprise = 2.0 * both.error(result) + after - _log_determinant(vision, result)
         if surprise < least:  # False for NaN
             best, least = result, surprise
-    return _optimised(factors(), config) if best is None else _poses(best)
+    return _optimised(factors()) if best is None else _poses(best)
 
 
 def _log_determinant(factors: Any, values: Any) -> float:
@@ -369,8 +367,8 @@ def _log_determinant(factors: Any, values: Any) -> float:
         return np.nan
 
 
-def _optimised(factors: _Factors, config: PoseGraphConfig) -> Array:
-    return _poses(minimised(factors.both(), factors.start, config))
+def _optimised(factors: _Factors) -> Array:
+    return _poses(minimised(factors.both(), factors.start))
 
 
 def _poses(values: Any) -> Array:

@@ -22,12 +22,19 @@ from vslam.types.map_kernels import (
 )
 from vslam.types.reprojection import stack_uvr
 
+# A recent landmark is culled if it is found in less than this fraction of the frames in which it
+# should be visible. [OS1 VI-B, printed]
+_MIN_FOUND_RATIO = 0.25
+# Two keyframes are joined by a covisibility edge if they share at least this many landmarks. [OS1
+# III-D, printed]
+MIN_SHARED = 15
+
 RECENT_KEYFRAMES = 3  # how long a landmark is on probation, in keyframes (ORB-SLAM, VI-B)
 
 
 def map_keyframe(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
     """Run local mapping for a new keyframe, which must already be linked to its landmarks."""
-    cull_recent_landmarks(map_, keyframe, camera, config)
+    cull_recent_landmarks(map_, keyframe, camera)
     triangulate_with_neighbours(map_, keyframe, camera, config)
     refresh_keyframe(map_, keyframe)
     fuse_neighbourhood(map_, keyframe, camera, config)
@@ -42,7 +49,7 @@ def refresh_keyframe(map_: Map, keyframe: int) -> None:
     refresh_landmarks(map_.arrays, map_.landmarks_of(keyframe), map_.scales)
 
 
-def cull_recent_landmarks(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
+def cull_recent_landmarks(map_: Map, keyframe: int, camera: Camera) -> None:
     """Erase recently created landmarks that tracking rarely finds, or that too few keyframes
     observe."""
     a, n = map_.arrays, map_.n_landmarks
@@ -50,7 +57,7 @@ def cull_recent_landmarks(map_: Map, keyframe: int, camera: Camera, config: Conf
     # A stereo observation counts twice. In a stereo map, one stereo and one monocular observation
     # are too few. In a monocular map, two observations are too few.
     too_few = 2 if camera.monocular else 3
-    _cull_landmarks(a, first, n, keyframe, config.mapping.min_found_ratio, too_few)
+    _cull_landmarks(a, first, n, keyframe, _MIN_FOUND_RATIO, too_few)
 
 
 @kernel
@@ -93,7 +100,7 @@ def local_window(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
     """Select the keyframes and landmarks of local bundle adjustment. Returns the ids of the
     keyframes that are optimised, of the keyframes that are held fixed, and of the landmarks."""
-    strong = strong_neighbours(map_, keyframe, config)
+    strong = strong_neighbours(map_, keyframe)
     window = np.concatenate([[keyframe], strong])[: config.mapping.max_ba_keyframes]
     landmarks, others = window_landmarks(
         map_.arrays, window.astype(np.int64), map_.n_landmarks, map_.n_keyframes
@@ -109,7 +116,7 @@ def local_window(
     return free.astype(np.int64), fixed.astype(np.int64), landmarks
 
 
-def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.int64]:
+def strong_neighbours(map_: Map, keyframe: int) -> NDArray[np.int64]:
     """Return the ids of the neighbours of a keyframe in the covisibility graph, those that share
     the most landmarks first.
 
@@ -117,7 +124,7 @@ def strong_neighbours(map_: Map, keyframe: int, config: Config) -> NDArray[np.in
     the ORB-SLAM paper).
     """
     neighbours, shared = map_.covisible(keyframe)
-    return neighbours[(shared >= config.mapping.min_shared) | (np.arange(len(shared)) == 0)]
+    return neighbours[(shared >= MIN_SHARED) | (np.arange(len(shared)) == 0)]
 
 
 @kernel
@@ -200,7 +207,7 @@ def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
     neighbours, shared = map_.covisible(keyframe)
     close = config.stereo.close_depth_baselines * camera.baseline
     restarts = map_.restarts
-    for neighbour in neighbours[shared >= config.mapping.min_shared]:
+    for neighbour in neighbours[shared >= MIN_SHARED]:
         if neighbour == 0 or neighbour in restarts:
             continue  # the first keyframe of a sub-map defines its frame
         seen, redundant = count_redundant(map_.arrays, int(neighbour), camera.bf, close)

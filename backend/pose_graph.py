@@ -22,6 +22,31 @@ from vslam.types.loops import LoopEdge, reversed_loop
 from vslam.types.map import Map, loop_of_living
 from vslam.types.map_kernels import covisible_pairs
 
+# An edge of the spanning tree across a restart of mapping is weak if its two keyframes share
+# fewer landmarks than this. [OS1 III-D, printed]
+_MIN_SHARED_TREE = 15
+# An edge shorter than this counts as this long in the drift model, in metres. [own]
+_MIN_LENGTH = 0.3
+# Standard deviation of the translation of a loop whose covariance is unknown, in metres. [own]
+_LOOP_TRANSLATION = 0.1
+# Standard deviation of the rotation of a loop whose covariance is unknown, in radians. [own]
+_LOOP_ROTATION = 0.005
+# Standard deviation of the translation of a weak edge, in metres. [own]
+_WEAK_TRANSLATION = 100.0
+# Standard deviation of the rotation of a weak edge, in radians. [own]
+_WEAK_ROTATION = 1.0
+# Standard deviation of the translation of a gap, as a fraction of the predicted distance. [own]
+_GAP_TRANSLATION = 0.5
+# Lower bound of the standard deviation of the translation of a gap, in metres per second of its
+# duration. [own]
+_GAP_SPEED = 2.0
+# Standard deviation of the rotation of a gap, in radians per second of its duration. [own]
+_GAP_ROTATION = 0.3
+# A gap shorter than this counts as this long, in seconds. [own]
+_MIN_GAP = 0.3
+# Upper bound of the number of Levenberg-Marquardt iterations. [own]
+_ITERATIONS = 50
+
 TREE, COVISIBLE, WEAK, LOOP, GAP = range(5)  # kinds of edges, see ``essential_graph``
 ROTATION_FIRST = [3, 4, 5, 0, 1, 2]  # the order of GTSAM
 HOLD = 1e-6  # standard deviation of the prior that fixes a keyframe, m and rad
@@ -105,7 +130,7 @@ def essential_graph(
     index = np.full(map_.n_keyframes, -1, np.int64)
     index[living] = np.arange(len(living))
     T_cw = map_.arrays.T_cw[living]
-    pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, config.min_shared_tree)
+    pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, _MIN_SHARED_TREE)
     seen = set(map(tuple, pairs.tolist()))
     # The kind of each edge, by its two ends. Later entries overwrite earlier ones.
     kind = dict.fromkeys(map(tuple, pairs[shared >= config.min_shared].tolist()), COVISIBLE)
@@ -197,7 +222,7 @@ def edge_sigmas(
     Args:
         seconds: ``(E, 2)`` timestamps of the ends of the edges.
     """
-    length = np.maximum(np.linalg.norm(T_i_j[:, :3, 3], axis=1), config.min_length)
+    length = np.maximum(np.linalg.norm(T_i_j[:, :3, 3], axis=1), _MIN_LENGTH)
     tree, path = kind == TREE, (kind == TREE) | (kind == COVISIBLE)
     covered = np.bincount(edges[path].ravel(), np.repeat(length[path], 2), n)
     once = np.bincount(edges[tree].ravel(), np.repeat(length[tree], 2), n)
@@ -208,11 +233,11 @@ def edge_sigmas(
     sigmas = root[:, None] * drift
     gap = kind == GAP
     elapsed = np.abs(seconds[gap, 1] - seconds[gap, 0])
-    share = config.gap_translation * length[gap]
-    sigmas[gap, 0] = np.maximum(share, config.gap_speed * elapsed)
-    sigmas[gap, 1] = config.gap_rotation * np.maximum(elapsed, config.min_gap)
-    sigmas[kind == WEAK] = config.weak_translation, config.weak_rotation
-    sigmas[kind == LOOP] = config.loop_translation, config.loop_rotation
+    share = _GAP_TRANSLATION * length[gap]
+    sigmas[gap, 0] = np.maximum(share, _GAP_SPEED * elapsed)
+    sigmas[gap, 1] = _GAP_ROTATION * np.maximum(elapsed, _MIN_GAP)
+    sigmas[kind == WEAK] = _WEAK_TRANSLATION, _WEAK_ROTATION
+    sigmas[kind == LOOP] = _LOOP_TRANSLATION, _LOOP_ROTATION
     return np.repeat(sigmas, 3, axis=1)
 
 
@@ -295,16 +320,16 @@ def optimised_values(
         plain = noise.Diagonal.Sigmas(sigma)
         model = noise.Robust.Create(cauchy, plain) if kind == LOOP else plain
         factors.add(between(i, j, pose, model))
-    return minimised(factors, start, config)
+    return minimised(factors, start)
 
 
-def minimised(factors: Any, start: Any, config: PoseGraphConfig) -> Any:
+def minimised(factors: Any, start: Any) -> Any:
     """Find the ``gtsam.Values`` that minimise the error of a ``gtsam.NonlinearFactorGraph``, using
     Levenberg-Marquardt."""
     import gtsam
 
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(config.iterations)
+    parameters.setMaxIterations(_ITERATIONS)
     parameters.setRelativeErrorTol(1e-5)
     return gtsam.LevenbergMarquardtOptimizer(factors, start, parameters).optimize()
 

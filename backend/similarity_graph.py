@@ -32,6 +32,16 @@ from vslam.types.loops import LoopEdge, scaled_loop
 from vslam.types.map import Map
 from vslam.types.map_kernels import refresh_landmarks
 
+# Standard deviation of the scale drift of monocular odometry, as the logarithm of the scale per
+# square root of a map unit. [own]
+_SCALE_DRIFT = 0.01
+# Standard deviation of the logarithm of the scale of a verified loop. [own]
+_LOOP_SCALE = 0.02
+# Standard deviation of the logarithm of the scale of a weak edge. [own]
+_WEAK_SCALE = 3.0
+# Standard deviation of the logarithm of the scale of a gap. [own]
+GAP_SCALE = 0.3
+
 
 def similarity(T_a_b: Matrix, scale: NDArray[np.float64] | float) -> Matrix:
     """Compose ``(..., 4, 4)`` similarities from ``(..., 4, 4)`` rigid motions and ``(...,)``
@@ -85,10 +95,10 @@ def optimise_similarities(graph: PoseGraph, S_wc: Matrix, config: PoseGraphConfi
 def sigmas(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     """Compute the ``(E, 7)`` standard deviations of the edges: rotation, translation, and the
     logarithm of the scale. The drift of the scale is modelled as a random walk along the path."""
-    scale = graph.sigmas[:, 3] * (config.scale_drift / config.rotation_drift)
-    scale[graph.kind == LOOP] = config.loop_scale
-    scale[graph.kind == WEAK] = config.weak_scale
-    scale[graph.kind == GAP] = config.gap_scale
+    scale = graph.sigmas[:, 3] * (_SCALE_DRIFT / config.rotation_drift)
+    scale[graph.kind == LOOP] = _LOOP_SCALE
+    scale[graph.kind == WEAK] = _WEAK_SCALE
+    scale[graph.kind == GAP] = GAP_SCALE
     return np.column_stack([graph.sigmas[:, ROTATION_FIRST], scale])
 
 

@@ -13,6 +13,15 @@ from vslam.types.map import NONE, Map
 from vslam.types.map_kernels import link_many
 from vslam.types.reprojection import chi_square_ratio, unpacked
 
+# Replaces `neighbours` for a monocular camera. [OS1 VI-C, customary]
+_MONOCULAR_NEIGHBOURS = 20
+# Upper bound of the cosine of the parallax of a triangulated point. The default corresponds to
+# 1.1 degrees. A larger value also accepts points with less parallax. [OS1 VI-C, customary]
+_MIN_PARALLAX_COSINE = 0.9998
+# With a monocular camera, landmarks are triangulated between two keyframes only if the distance
+# between the keyframes is at least this fraction of the median depth. [OS1 VI-C, customary]
+_MIN_BASELINE_RATIO = 0.01
+
 EPIPOLAR_CHI2 = 3.84  # 95 % quantile with 1 degree of freedom
 SECTIONS = 512  # number of bins for the direction of an epipolar plane
 
@@ -55,12 +64,12 @@ def triangulate_with_neighbours(map_: Map, keyframe: int, camera: Camera, config
     neighbours, _ = map_.covisible(keyframe)
     limit, min_baseline = config.mapping.neighbours, camera.baseline
     if camera.monocular:
-        limit = config.mapping.monocular_neighbours
+        limit = _MONOCULAR_NEIGHBOURS
     for neighbour in neighbours[:limit]:
         a = map_.arrays
         if camera.monocular:
             depth = median_depth(map_, int(neighbour))
-            min_baseline = config.mapping.min_baseline_ratio * depth
+            min_baseline = _MIN_BASELINE_RATIO * depth
         xyz, rows_1, rows_2 = triangulate_pair(
             a,
             keyframe,
@@ -69,7 +78,7 @@ def triangulate_with_neighbours(map_: Map, keyframe: int, camera: Camera, config
             map_.scales,
             min_baseline,
             config.mapping.epipolar_distance,
-            config.mapping.min_parallax_cosine,
+            _MIN_PARALLAX_COSINE,
         )
         ids = map_.add_landmarks(xyz, a.descriptor[rows_1], keyframe)
         link_many(map_.arrays, rows_1, ids)

@@ -22,6 +22,12 @@ from vslam.frontend.track import Track
 from vslam.support.kernels import inner_kernel, kernel
 from vslam.types.features import PATCH_RADIUS, PATCH_SIDE, LandmarkPatches, Pyramid
 
+# Upper bound of the number of Gauss-Newton iterations. [own]
+_ITERATIONS = 7
+# Upper bound of the shift between a keypoint and its aligned position, in x and in y, in pixels
+# of its octave. [own]
+_MAX_SHIFT = 2.0
+
 HALF = 4  # half width of the compared window, pixels
 SIDE = 2 * HALF + 1
 WIDE = SIDE + 2  # one more pixel on each side, to compute the gradients
@@ -112,8 +118,8 @@ def find_patches(
         known.shift,
         known.where[at],
         warp,
-        config.iterations,
-        config.max_shift,
+        _ITERATIONS,
+        _MAX_SHIFT,
         config.min_correlation,
     )
 

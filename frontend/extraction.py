@@ -177,7 +177,7 @@ def find_corners(
     pair = balanced(left, right_image, sides)
     built = pyramid if pair[0] is left else None  # it may have been brightened
     found, right = extract_in_any_light(pair, config, image_map, allowed, built)
-    return Corners(found, match_stereo(found, right, camera, config.stereo), sides=sides)
+    return Corners(found, match_stereo(found, right, camera), sides=sides)
 
 
 def matched(corners: Corners, context: Context, keypoints: Keypoints | None = None) -> Extracted:
@@ -204,7 +204,7 @@ def matched(corners: Corners, context: Context, keypoints: Keypoints | None = No
         more = extract_at(found, *keypoints)
         found, order = found.joined(more)
         if matches is not None:
-            added = match_stereo(more, matches.right, camera, config.stereo)
+            added = match_stereo(more, matches.right, camera)
             matches = matches.joined(added, order)
     if matches is None:
         u_right = np.full(len(found.xy), np.nan, np.float32)

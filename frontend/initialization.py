@@ -27,6 +27,30 @@ from vslam.types.features import Features
 from vslam.types.geometry import Matrix
 from vslam.types.reprojection import CHI2_MONO, stack_uvr
 
+# Search radius for matches in the second view, in pixels. A larger radius allows faster motion
+# between the views. [OS1 IV, customary]
+_WINDOW = 100.0
+# Upper bound of the descriptor distance of a match, in bits. [OS1 IV, customary]
+_MATCH_DISTANCE = 50
+# Upper bound of the ratio of the best to the second-best distance. [OS1 IV, customary]
+_MATCH_RATIO = 0.9
+# Number of RANSAC draws for each of the two models. ORB-SLAM uses 200. [OS1 IV, own]
+_DRAWS = 300
+# The homography is chosen if its fraction of the sum of both scores is above this value.
+# Otherwise, the fundamental matrix is chosen. [OS1 IV, printed]
+_HOMOGRAPHY_SHARE = 0.45
+# Upper bound of the reprojection error of an inlier, in pixels at octave 0. [OS1 IV, customary]
+_MAX_ERROR = 2.0
+# At least this many points must be triangulated with a parallax of `min_parallax_deg`. [OS1 IV,
+# customary]
+_MIN_POINTS = 50
+# At least this fraction of the inliers of the model must be triangulated in front of both
+# cameras. [OS1 IV, own]
+_MIN_POINT_SHARE = 0.7
+# The motion is ambiguous if the second-best motion explains more than this fraction of the points
+# that the best motion explains. An ambiguous motion is rejected. [OS1 IV, customary]
+_MAX_RIVAL_SHARE = 0.7
+
 CHI2_LINE = 3.841  # 95 % quantile of chi-square with 1 degree of freedom: distance from a line
 # Matches per sample. The eight-point algorithm needs all of them; a homography needs only four.
 SAMPLE = 8
@@ -78,21 +102,21 @@ def match_views(
     Returns:
         ``(N,)`` indices of the matched features in ``before``, and ``(N,)`` indices in ``now``.
     """
-    config, camera = context.config.initialization, context.camera
+    camera = context.camera
     n = len(before)
     octave = before.octave.astype(np.int64)
     found, _ = search_windows(
         Projections(
             stack_uvr(before.xy, np.zeros(n)),
-            np.full(n, config.window),
+            np.full(n, _WINDOW),
             octave,
             octave,
             before.descriptors.view(np.uint64),
         ),
         Searchable.of_features(now, camera.width, camera.height),
         np.ones(len(now), np.bool_),
-        config.match_distance,
-        config.match_ratio,
+        _MATCH_DISTANCE,
+        _MATCH_RATIO,
     )
     first = np.flatnonzero(found >= 0)
     second = found[first].astype(np.int64)
@@ -118,7 +142,7 @@ def reconstruct(
     """
     if len(xy_1) < SAMPLE:
         return None
-    model = select_model(xy_1, xy_2, sigma, config, seed=seed)
+    model = select_model(xy_1, xy_2, sigma, seed=seed)
     K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
     if model.kind == "homography":
         motions = motions_of_homography(np.linalg.inv(K) @ model.matrix @ K)
@@ -127,17 +151,15 @@ def reconstruct(
     match = np.flatnonzero(model.inlier)
     if not motions:
         return None
-    views = [
-        _triangulate(T, xy_1[match], xy_2[match], sigma[match], camera, config) for T in motions
-    ]
+    views = [_triangulate(T, xy_1[match], xy_2[match], sigma[match], camera) for T in motions]
     counts = np.array([np.count_nonzero(good) for _, good, _ in views])
     best = int(np.argmax(counts))
     rival = int(np.sort(counts)[-2])
     points, good, cosine = views[best]
-    widest = np.sort(cosine[good])[: config.min_points]  # cosines of the largest parallaxes
+    widest = np.sort(cosine[good])[:_MIN_POINTS]  # cosines of the largest parallaxes
     if (
-        counts[best] < max(config.min_points, config.min_point_share * len(match))
-        or rival > config.max_rival_share * counts[best]
+        counts[best] < max(_MIN_POINTS, _MIN_POINT_SHARE * len(match))
+        or rival > _MAX_RIVAL_SHARE * counts[best]
         or widest[-1] > np.cos(np.radians(config.min_parallax_deg))
     ):
         return None
@@ -145,9 +167,7 @@ def reconstruct(
     return TwoViews(motions[best], match[kept], points[kept])
 
 
-def select_model(
-    xy_1: Matrix, xy_2: Matrix, sigma: Matrix, config: InitializationConfig, *, seed: int
-) -> TwoViewModel:
+def select_model(xy_1: Matrix, xy_2: Matrix, sigma: Matrix, *, seed: int) -> TwoViewModel:
     """Fit a homography and a fundamental matrix to the matches, and select one of them by its score
     (ORB-SLAM paper, section IV, steps 2 and 3).
 
@@ -159,7 +179,7 @@ def select_model(
     x_1, N_1 = normalised(xy_1)
     x_2, N_2 = normalised(xy_2)
     rng = np.random.default_rng(seed)
-    drawn = np.argpartition(rng.random((config.draws, n)), SAMPLE - 1, axis=1)[:, :SAMPLE]
+    drawn = np.argpartition(rng.random((_DRAWS, n)), SAMPLE - 1, axis=1)[:, :SAMPLE]
     N_2_inverse = np.linalg.inv(N_2)
 
     def homographies(chosen: NDArray[np.integer]) -> Matrix:
@@ -185,7 +205,7 @@ def select_model(
     (H, score_H, inlier_H), (F, score_F, inlier_F) = found
     total = score_H + score_F
     share = score_H / total if total > 0.0 else 0.0
-    if share > config.homography_share:
+    if share > _HOMOGRAPHY_SHARE:
         return TwoViewModel("homography", H, inlier_H, share)
     return TwoViewModel("fundamental", F, inlier_F, share)
 
@@ -337,7 +357,6 @@ def _triangulate(
     xy_2: Matrix,
     sigma: Matrix,
     camera: Camera,
-    config: InitializationConfig,
 ) -> tuple[Matrix, NDArray[np.bool_], Matrix]:
     """Triangulate N matches.
 
@@ -358,7 +377,7 @@ def _triangulate(
         depth_2 = (ab * on_1 - aa * on_2) / determinant
         points = 0.5 * (depth_1[:, None] * ray_1 + centre_2 + depth_2[:, None] * ray_2)
         in_2 = points @ R.T + t
-        limit = (config.max_error * sigma) ** 2
+        limit = (_MAX_ERROR * sigma) ** 2
         good = (depth_1 > 0) & (depth_2 > 0) & (points[:, 2] > 0) & (in_2[:, 2] > 0)
         good &= _squared(camera.project(points)[:, :2] - xy_1) < limit
         good &= _squared(camera.project(in_2)[:, :2] - xy_2) < limit

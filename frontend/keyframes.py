@@ -15,6 +15,27 @@ from vslam.types.geometry import transform
 from vslam.types.map_view import MapView
 from vslam.types.states import PolicyState
 
+# If keyframes add on average fewer close points than `min_tracked_close`, this fraction of the
+# average replaces `min_tracked_close` (docs/research/motorway.md). [own]
+_MIN_KEPT_CLOSE = 0.2
+# Before the first observation, the number of close points that a keyframe adds is assumed to be
+# this multiple of `min_tracked_close`. [own]
+_FIRST_GAIN = 2.0
+# Weight of the latest keyframe in the running mean of the number of close points that a keyframe
+# adds. A larger weight adapts faster to the scene. [own]
+_GAIN_WEIGHT = 0.2
+# When frames are tracked by patches, a keyframe is planned up to this many frames ahead, so that
+# its features can be extracted in advance. [own]
+_PATCH_LEAD_FRAMES = 2
+# A keyframe is inserted, even while local mapping is busy, if the frame tracks less than this
+# fraction of the landmarks of the reference keyframe. [OS1 V-E, customary]
+_URGENT_RATIO = 0.25
+# With a monocular camera, a keyframe is also inserted while local mapping is busy if fewer
+# landmarks than this are tracked. [own]
+_MONOCULAR_MIN_TRACKED = 100
+# The same fraction for a monocular camera. [own]
+_MONOCULAR_URGENT_RATIO = 0.5
+
 
 @dataclass(frozen=True)
 class KeyframeEvidence:
@@ -81,7 +102,7 @@ def needs_keyframe(
     required: float = config.min_tracked_close
     tracked_far = evidence.n_inliers - evidence.tracked_close
     if evidence.gained_close < required <= tracked_far:
-        required = config.min_kept_close * evidence.gained_close
+        required = _MIN_KEPT_CLOSE * evidence.gained_close
     gains = evidence.untracked_close is None or evidence.untracked_close > config.min_new_close
     lacks_close = evidence.tracked_close < required and gains
     moved_on = evidence.n_inliers < config.max_tracked_ratio * evidence.n_reference
@@ -93,7 +114,7 @@ def needs_keyframe(
         return True
     if not (moved_on or lacks_close):
         return False
-    urgent = lacks_close or evidence.n_inliers < config.urgent_ratio * evidence.n_reference
+    urgent = lacks_close or evidence.n_inliers < _URGENT_RATIO * evidence.n_reference
     return evidence.mapping_idle or urgent
 
 
@@ -110,14 +131,12 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
     if tracked >= config.monocular_ratio * reference:
         return False
     # In a sharp turn, the view changes faster than it is mapped, so the keyframe cannot wait.
-    urgent = tracked < max(config.monocular_urgent_ratio * reference, config.monocular_min_tracked)
+    urgent = tracked < max(_MONOCULAR_URGENT_RATIO * reference, _MONOCULAR_MIN_TRACKED)
     late = evidence.seconds_since_keyframe >= config.max_interval_s
     return evidence.mapping_idle or urgent or late
 
 
-def count_close(
-    state: PolicyState, tracked_close: int, frame: int, config: KeyframeConfig
-) -> PolicyState:
+def count_close(state: PolicyState, tracked_close: int, frame: int) -> PolicyState:
     """Update the running mean of the number of close points that the first frame after a keyframe
     tracks. Returns the new state, which is unchanged if this frame is not the first after a
     keyframe.
@@ -131,7 +150,7 @@ def count_close(
     """
     if not state.gain_awaited:
         return state
-    mean = state.gained_close + config.gain_weight * (tracked_close - state.gained_close)
+    mean = state.gained_close + _GAIN_WEIGHT * (tracked_close - state.gained_close)
     return PolicyState(mean, False, tracked_close, frame, state.due)
 
 
@@ -159,7 +178,7 @@ class KeyframePolicy:
     def __init__(self, context: Context, state: PolicyState | None = None) -> None:
         self._context = context
         self._config = context.config.keyframes
-        first = self._config.first_gain * self._config.min_tracked_close
+        first = _FIRST_GAIN * self._config.min_tracked_close
         self.state = PolicyState(first, gain_awaited=False) if state is None else state
 
     @property
@@ -180,7 +199,7 @@ class KeyframePolicy:
             close = depth < self._context.close_depth
             untracked_close = int(np.count_nonzero(close & ~tracked))
         tracked_close = int(np.count_nonzero(close & tracked))
-        state = count_close(self.state, tracked_close, track.index, self._config)
+        state = count_close(self.state, tracked_close, track.index)
         self.state = state
         return KeyframeEvidence(
             seconds_since_keyframe=seconds_since_keyframe,
@@ -234,7 +253,7 @@ class KeyframePolicy:
         can be extracted in the background.
         """
         if self.due < 0:
-            soon = range(self._config.patch_lead_frames + 1)
+            soon = range(_PATCH_LEAD_FRAMES + 1)
             planned = (index + k for k in soon if self.wants_keyframe(evidence.ahead(k)))
             self.state = replace(self.state, due=next(planned, -1))
         elif evidence.n_inliers < self._config.min_tracked_close and self.wants_keyframe(evidence):

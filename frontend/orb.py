@@ -20,6 +20,9 @@ from vslam.support.kernels import borrowed, inner_kernel, kernel
 from vslam.types.context import scale_factors
 from vslam.types.features import Pyramid, level_of
 
+# Side of the square cells in which the FAST threshold adapts, in pixels. [OS1 V-A, customary]
+_CELL_SIZE = 35
+
 # Radius of the disc for the intensity centroid, pixels (Rublee et al., section 3.2).
 PATCH_RADIUS = 15
 LANES = 32  # pixels read per row of the disc: its 31 columns, and one more with weight 0
@@ -88,7 +91,7 @@ def extract(
         features_per_level(config),
         config.fast_threshold,
         config.fast_threshold_min,
-        config.cell_size,
+        _CELL_SIZE,
         DISC,
         PATTERN,
     )

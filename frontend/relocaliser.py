@@ -28,6 +28,19 @@ from vslam.types.loops import LastSeen, Localisation, LoopCandidate
 from vslam.types.map import Map
 from vslam.types.map_view import LocalMap, local_map
 
+# Upper bound of the descriptor distance of a match, in bits. [OS1 V-C, customary]
+_MATCH_DISTANCE = 50
+# Upper bound of the ratio of the best to the second-best distance. [OS1 V-C, customary]
+_MATCH_RATIO = 0.75
+# At least this many landmarks must be matched by descriptor. [OS1 V-C, customary]
+_MIN_MATCHES = 15
+# RANSAC must find at least this many inliers. [OS1 V-C, customary]
+_MIN_CONSENSUS = 10
+# Search radius of the first guided search, in pixels at octave 0. [OS1 V-C, own]
+_FIRST_WINDOW = 8.0
+# The landmarks of this many keyframes around a candidate place are matched. [own]
+_NEIGHBOURS = 20
+
 Locate = Callable[[Image | None, Features, Map], list[LoopCandidate]]
 # Finds the pose of a frame near one of the candidates by other means than ORB descriptors.
 # Candidates that the camera cannot have reached since it was last tracked are left out. The result
@@ -75,7 +88,7 @@ class Relocaliser:
         candidates = self._locate(images.image, track.features, map_)
         for candidate in candidates[: config.max_candidates]:
             place = local_map(map_, candidate.match, 1)
-            around = local_map(map_, candidate.match, config.neighbours)
+            around = local_map(map_, candidate.match, _NEIGHBOURS)
             seed = candidate.match
             found = relocalised(lost, place, around, context, seed=seed, mask=images.mask)
             if found is not None:
@@ -126,21 +139,19 @@ def relocalised(
     """
     config = context.config.relocalization
     features = track.features
-    feature, landmark = match_descriptors(
-        features, place, config.match_distance, config.match_ratio
-    )
-    if len(feature) < config.min_matches:
+    feature, landmark = match_descriptors(features, place, _MATCH_DISTANCE, _MATCH_RATIO)
+    if len(feature) < _MIN_MATCHES:
         return None
     points = place.xyz[landmark]
     T_cw, inlier = sampled_pose(
-        features, feature, points, context, min_inliers=config.min_consensus, seed=seed
+        features, feature, points, context, min_inliers=_MIN_CONSENSUS, seed=seed
     )
-    if np.count_nonzero(inlier) < config.min_consensus:
+    if np.count_nonzero(inlier) < _MIN_CONSENSUS:
         return None
     matched = track.without().matching(feature[inlier], place.ids[landmark[inlier]], points[inlier])
     found = refine(matched, T_cw, surroundings, context)
-    for window in (config.first_window, context.config.tracking.local_window):
-        if found.n_inliers < config.min_consensus:
+    for window in (_FIRST_WINDOW, context.config.tracking.local_window):
+        if found.n_inliers < _MIN_CONSENSUS:
             return None
         found = track_local_map(found, surroundings, context, mask, window)
     elsewhere = count_elsewhere(features.xy[found.landmark >= 0, 0], context.camera.width)

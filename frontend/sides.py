@@ -18,6 +18,13 @@ from numpy.typing import NDArray
 from vslam.config import StereoConfig
 from vslam.types.states import ComparedSides
 
+# The darker image of a stereo pair is brightened before stereo matching if the gain between the
+# two images is above this value, in stops (factors of two). [own]
+_BALANCE_FROM = 0.3
+# A difference in brightness counts as a gain only if the gains of dark and of bright pixels
+# differ by at most this value, in stops. [own]
+_MAX_GAIN_DISAGREEMENT = 0.75
+
 Grey = NDArray[np.uint8]
 
 _STRIDE = 8  # a few thousand pixels determine the quantiles to within a grey level
@@ -123,14 +130,14 @@ def _stops(left: NDArray[np.float64], right: NDArray[np.float64], config: Stereo
     if min(l_low + l_high, r_low + r_high) < _MIN_RANGE or least <= 0:
         return 0.0
     gain = log2((l_low + l_high) / (r_low + r_high))
-    if abs(gain) <= config.balance_from:
+    if abs(gain) <= _BALANCE_FROM:
         return 0.0
     if least >= _MIN_RANGE:  # over a smaller range, the gains of both halves differ by rounding
         low, high = log2(l_low / r_low), log2(l_high / r_high)
         # If one image has more bright pixels, only its upper half is stretched. This is not a gain.
-        if min(low * np.sign(gain), high * np.sign(gain)) <= config.balance_from:
+        if min(low * np.sign(gain), high * np.sign(gain)) <= _BALANCE_FROM:
             return 0.0
-        if abs(low - high) > config.max_gain_disagreement:
+        if abs(low - high) > _MAX_GAIN_DISAGREEMENT:
             return 0.0
     return gain if _proportional(left, right, top) else 0.0
 

@@ -7,11 +7,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import StereoConfig
 from vslam.frontend.orb import Extraction
 from vslam.support.kernels import hamming, inline, inner_kernel, kernel
 from vslam.types.camera import Camera
 from vslam.types.features import MIN_DISPARITY, level_of, level_pixel
+
+# Upper bound of the descriptor distance of a match, in bits. [OS2 III-A, customary]
+_MAX_DESCRIPTOR_DISTANCE = 75
+# Half width of the patch that is compared using the sum of absolute differences (SAD), in pixels
+# of the keypoint's octave. [OS2 III-A, customary]
+_SAD_WINDOW = 5
+# The patch is searched for up to this distance to the left and to the right, in pixels of the
+# keypoint's octave. [OS2 III-A, customary]
+_SAD_SEARCH = 5
 
 LANES = 16  # shifts of the SAD window that are evaluated at once
 # Half width of the patch for sub-pixel refinement, pixels. A larger patch would more often include
@@ -42,9 +50,7 @@ class StereoMatches(NamedTuple):
         return StereoMatches(self.right, u_right, np.concatenate([self.sad, other.sad])[order])
 
 
-def match_stereo(
-    left: Extraction, right: Extraction, camera: Camera, config: StereoConfig
-) -> StereoMatches:
+def match_stereo(left: Extraction, right: Extraction, camera: Camera) -> StereoMatches:
     """Match each left feature with a right feature, independently of the other left features.
 
     A right feature is a candidate if it meets three conditions. It lies in the same row as the left
@@ -63,9 +69,9 @@ def match_stereo(
         left.pyramid.shapes,
         left.pyramid.scales,
         camera.fx,
-        config.max_descriptor_distance,
-        config.sad_window,
-        config.sad_search,
+        _MAX_DESCRIPTOR_DISTANCE,
+        _SAD_WINDOW,
+        _SAD_SEARCH,
     )
     return StereoMatches(right, u_right, sad)
 

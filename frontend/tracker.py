@@ -18,6 +18,8 @@ from vslam.frontend.pose_alignment import align_pose
 from vslam.frontend.rig import corrected
 from vslam.frontend.track import By, Images, Prediction, Track
 from vslam.frontend.tracking import (
+    MIN_INLIERS_LOST,
+    MIN_INLIERS_MOTION,
     judge,
     track_descriptors,
     track_local_map,
@@ -30,6 +32,21 @@ from vslam.types.features import Extracted, TrackingState, nearest_features
 from vslam.types.geometry import Matrix, inverse, transform
 from vslam.types.map_view import MapView
 from vslam.types.states import Standstill
+
+# If the features of a frame do not match either, its pose is nevertheless found by patches if at
+# least this fraction of the patches agree with it. The frame is then WEAK. [own]
+_PATCH_FALLBACK_RATIO = 0.5
+# If too few descriptors of a new keyframe match, each landmark whose patch was found is matched
+# to the nearest feature. The distance is at most this value, in pixels of the feature's octave.
+# [own]
+_PATCH_FEATURE_REACH = 2.0
+# Replaces `local_window` for a frame that could be matched with neither the previous frame nor
+# the reference keyframe, in pixels at octave 0. [own]
+_PREDICTED_WINDOW = 7.0
+# A frame is matched with the local map only if tracking from the previous frame, from the
+# reference keyframe, with `predicted_window` or with `sudden_window` gives at least this many
+# inliers. Otherwise, the frame is LOST. [OS1 V-B, customary]
+_MIN_INLIERS_FRAME = 10
 
 # The prediction of the motion is wrong by at most this acceleration, m/s^2, in ordinary drives. A
 # pose that implies a larger one needs IMPLAUSIBLE^-1 times as many landmarks that agree with it.
@@ -176,7 +193,7 @@ class Tracker:
             frame.features.xy,
             frame.features.octave,
             self._context.scales,
-            self._config.tracking.patch_feature_reach,
+            _PATCH_FEATURE_REACH,
         )
         found = found[index]
         frame = frame.matching(feature, track.landmark[found], track.xyz[found])
@@ -210,7 +227,7 @@ class Tracker:
         still = predicted.standstill(view)
         view, context = _trusting(view, still), self._context
         first = self._track_previous_frame(track, images, predicted, view)
-        if first.n_inliers < self._config.tracking.min_inliers_frame:
+        if first.n_inliers < _MIN_INLIERS_FRAME:
             return replace(track, n_matches=first.n_inliers)
         local, patches = view.local_landmarks, view.patches
         found = track_local_map(first, local, context, images.mask, patches=patches)
@@ -243,11 +260,11 @@ class Tracker:
             if self._is_trusted(found, config.min_inlier_ratio):
                 return found
         found = track_descriptors(track, view.reference_landmarks, T_cw, context)
-        if found.n_inliers >= config.min_inliers_frame or predicted.twist is None:
+        if found.n_inliers >= _MIN_INLIERS_FRAME or predicted.twist is None:
             return found
         # After a sudden change in brightness, landmarks that older frames observed may match when
         # the landmarks of the last frame do not.
-        window, patches = config.predicted_window, view.patches
+        window, patches = _PREDICTED_WINDOW, view.patches
         found = track_local_map(track, local, context, images.mask, window, patches)
         if self._is_trusted(found, config.min_inlier_ratio):
             return found
@@ -258,7 +275,7 @@ class Tracker:
         return track
 
     def _is_trusted(self, track: Track, min_ratio: float) -> bool:
-        least = max(self._config.tracking.min_inliers_motion, min_ratio * track.n_matches)
+        least = max(MIN_INLIERS_MOTION, min_ratio * track.n_matches)
         return track.n_inliers >= least
 
     def _is_doubtful(self, n_inliers: int, predicted: Prediction, view: MapView) -> bool:
@@ -296,8 +313,8 @@ def judge_patches(track: PatchTrack, still: Standstill | None, context: Context)
     trusted = config.patch_min_inlier_ratio * track.n_matches
     if n_inliers >= max(config.patch_min_inliers, trusted):
         return TrackingState.OK
-    plausible = config.patch_fallback_ratio * track.n_matches
-    if still is None and n_inliers >= max(config.min_inliers_lost, plausible):
+    plausible = _PATCH_FALLBACK_RATIO * track.n_matches
+    if still is None and n_inliers >= max(MIN_INLIERS_LOST, plausible):
         return TrackingState.WEAK
     return TrackingState.LOST
 

@@ -31,6 +31,35 @@ from vslam.types.geometry import Matrix, compose, inverse, transform
 from vslam.types.map_view import LocalMap
 from vslam.types.reprojection import stack_uvr
 
+# Upper bound of the descriptor distance when landmarks are matched near their projections, in
+# bits. [OS1 V-D, customary]
+_MATCH_DISTANCE = 100
+# Upper bound of the ratio of the best to the second-best distance when the local map is matched.
+# [OS1 V-D, customary]
+_MATCH_RATIO = 0.8
+# Upper bound of the descriptor distance when a frame is matched with the reference keyframe, in
+# bits. [OS1 V-B, customary]
+_REFERENCE_DISTANCE = 50
+# Upper bound of the ratio of the best to the second-best distance when a frame is matched with
+# the reference keyframe. [OS1 V-B, customary]
+_REFERENCE_RATIO = 0.7
+# Search radius if the motion has changed so suddenly that a frame would be LOST, in pixels at
+# octave 0. The pose is then found by RANSAC among the matches with the previous frame. [own]
+_SUDDEN_WINDOW = 100.0
+# A frame is tracked from the reference keyframe if tracking from the previous frame has fewer
+# inliers than this. [OS1 V-B, customary]
+MIN_INLIERS_MOTION = 20
+# A frame of an RGB-D camera is also LOST if less than this fraction of its matches are inliers.
+# [own]
+_DEPTH_MIN_INLIER_RATIO = 0.2
+# A frame with fewer inliers than this in the local map is LOST. Its pose is only predicted. [own]
+MIN_INLIERS_LOST = 15
+# Upper bound of the number of RANSAC draws. [OS1 V-C, own]
+_MAX_DRAWS = 600
+# The probability with which RANSAC must draw at least one sample without outliers. [OS1 V-C,
+# customary]
+_CONFIDENCE = 0.99
+
 
 def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
     """Compute the ``(N,)`` float64 stereo depth of each feature, in metres; NaN without a stereo
@@ -55,15 +84,14 @@ def track_motion(
     Returns:
         The frame with its pose and its matches. ``n_inliers`` is 0 if too few points match.
     """
-    config = context.config.tracking
     found = track
     for widening in (1.0, 2.0, 4.0):
         window = widening * context.motion_window
         matched = _match_previous(track, previous, T_cw, context, window, 1.0)
-        if matched.n_matches < config.min_inliers_motion:
+        if matched.n_matches < MIN_INLIERS_MOTION:
             continue
         found = refine(matched, T_cw, local, context)
-        if found.n_inliers >= config.min_inliers_motion:
+        if found.n_inliers >= MIN_INLIERS_MOTION:
             break
     return found
 
@@ -77,11 +105,8 @@ def track_sudden_motion(
     Therefore, the pose is first estimated by P3P inside RANSAC. Arguments and result are those of
     ``track_motion``.
     """
-    config = context.config.tracking
-    least = config.min_inliers_motion
-    matched = _match_previous(
-        track, previous, T_cw, context, config.sudden_window, config.match_ratio
-    )
+    least = MIN_INLIERS_MOTION
+    matched = _match_previous(track, previous, T_cw, context, _SUDDEN_WINDOW, _MATCH_RATIO)
     if matched.n_matches < least:
         return track
     feature = np.flatnonzero(np.isfinite(matched.xyz[:, 0]))
@@ -114,15 +139,14 @@ def sampled_pose(
         The ``(4, 4)`` pose (world to camera), and an ``(N,)`` bool mask of the inliers. There may
         be fewer inliers than ``min_inliers``.
     """
-    config = context.config.relocalization
     return ransac_pose(
         points,
         *observations(features, chosen, context),
         context.camera.intrinsics,
         np.uint64(seed),
         min_inliers,
-        config.max_draws,
-        config.confidence,
+        _MAX_DRAWS,
+        _CONFIDENCE,
     )
 
 
@@ -209,11 +233,10 @@ def track_descriptors(track: Track, reference: LocalMap, T_cw: Matrix, context: 
     Returns:
         The frame with its pose and its matches. ``n_inliers`` is 0 if too few landmarks match.
     """
-    config = context.config.tracking
     feature, landmark = match_descriptors(
-        track.features, reference, config.reference_distance, config.reference_ratio
+        track.features, reference, _REFERENCE_DISTANCE, _REFERENCE_RATIO
     )
-    if len(feature) < config.min_inliers_lost:
+    if len(feature) < MIN_INLIERS_LOST:
         return track
     points = reference.xyz[landmark]
     matched = track.without().matching(feature, reference.ids[landmark], points)
@@ -223,7 +246,7 @@ def track_descriptors(track: Track, reference: LocalMap, T_cw: Matrix, context: 
         feature,
         points,
         context,
-        min_inliers=max(found.n_inliers + 1, config.min_inliers_lost),
+        min_inliers=max(found.n_inliers + 1, MIN_INLIERS_LOST),
         seed=track.index,
     )
     if np.count_nonzero(inlier) <= found.n_inliers:
@@ -261,7 +284,7 @@ def track_local_map(
         Projections(uvr, radius, octave - 1, octave, local.descriptor),
         track.landmark < 0,
         context,
-        config.tracking.match_ratio,
+        _MATCH_RATIO,
     )
     in_map = track.without(track.landmark < 0)  # without the points that are not in the map
     matched = in_map.matching(feature, local.ids[landmark], local.xyz[landmark])
@@ -305,7 +328,7 @@ def _search(
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """Return the ``(M,)`` indices of the features that ``search_windows`` matches, and the ``(M,)``
     indices of their projections."""
-    camera, max_distance = context.camera, context.config.tracking.match_distance
+    camera, max_distance = context.camera, _MATCH_DISTANCE
     searchable = Searchable.of_features(features, camera.width, camera.height)
     found, _ = search_windows(projections, searchable, free, max_distance, ratio)
     matched = np.flatnonzero(found >= 0)
@@ -342,8 +365,8 @@ def judge(n_matches: int, n_inliers: int, context: Context) -> TrackingState:
     """Decide from the number of matches and of inliers whether the pose of a frame can be used."""
     config = context.config.tracking
     # The search windows of an RGB-D camera are wide, so that even a wrong pose has some inliers.
-    share = config.depth_min_inlier_ratio if context.camera.depth else 0.0
-    if n_inliers < config.min_inliers_lost or n_inliers < share * n_matches:
+    share = _DEPTH_MIN_INLIER_RATIO if context.camera.depth else 0.0
+    if n_inliers < MIN_INLIERS_LOST or n_inliers < share * n_matches:
         return TrackingState.LOST
     return TrackingState.WEAK if n_inliers < config.min_inliers else TrackingState.OK
 

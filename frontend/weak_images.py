@@ -23,6 +23,28 @@ from vslam.support.kernels import kernel
 from vslam.types.camera import ImageMap
 from vslam.types.features import Pyramid
 
+# Standard deviation of the noise that should remain after the blur, in grey levels. A smaller
+# value blurs the image more. [own]
+_NOISE_LEFT = 4.0
+# Upper bound of the standard deviation of the Gaussian blur, in pixels. [own]
+_MAX_BLUR = 3.5
+# An image counts as out of focus if the mean absolute second difference of its grey values is
+# below this fraction of its contrast. The contrast of such an image is not raised. In sharp
+# images, this ratio is 0.4 or more. [own]
+_LEAST_DETAIL = 0.25
+# Contrast is raised until the grey values in each window have this standard deviation, in grey
+# levels. The default is the contrast of KITTI's images on a bright day. [own]
+_RAISED_CONTRAST = 12.0
+# Side of the window in which contrast is raised, in pixels. [own]
+_CONTRAST_WINDOW = 33
+# The contrast of a window counts as at least this fraction of the median contrast of all windows.
+# This limits how much the noise in flat parts of the image is amplified. A larger fraction
+# amplifies flat parts less. [own]
+_FLAT_SHARE = 0.25
+# The contrast of a window also counts as at least this value, in grey levels. Rounding alone
+# causes a standard deviation of this size. [own]
+_LEAST_CONTRAST = 0.15
+
 Grey = NDArray[np.uint8]
 
 ROW_STRIDE = 32  # noise is measured in every 32nd row: 15,000 pixels of a KITTI image
@@ -63,7 +85,7 @@ def extract_in_any_light(
     images = without_noise(images, weak)
     found = list(image_map(found_in, images))
     if is_faint(images, [len(one.xy) for one in found], config):
-        images = list(image_map(lambda image: with_contrast(image, weak), images))
+        images = list(image_map(lambda image: with_contrast(image), images))
         found = list(image_map(found_in, images))
     return found
 
@@ -81,7 +103,7 @@ def without_noise(images: Sequence[Grey], config: WeakImageConfig) -> Sequence[G
     noise = max(sigma for sigma, _ in measured)
     if noise < config.noise_from:
         return images
-    blur = min(noise / (_GAUSSIAN * config.noise_left), config.max_blur)
+    blur = min(noise / (_GAUSSIAN * _NOISE_LEFT), _MAX_BLUR)
     return [np.asarray(cv2.GaussianBlur(image, (0, 0), blur), np.uint8) for image in images]
 
 
@@ -142,7 +164,7 @@ def is_faint(images: Sequence[Grey], counts: Sequence[int], config: Config) -> b
 
 def _is_faint(image: Grey, config: WeakImageConfig) -> bool:
     deviation = contrast(image)
-    return deviation < config.low_contrast and detail(image) >= config.least_detail * deviation
+    return deviation < config.low_contrast and detail(image) >= _LEAST_DETAIL * deviation
 
 
 def detail(image: Grey) -> float:
@@ -161,7 +183,7 @@ def contrast(image: Grey) -> float:
     return float(np.median(blocks.reshape(rows // _BLOCK, _BLOCK, -1, _BLOCK).std(axis=(1, 3))))
 
 
-def with_contrast(image: Grey, config: WeakImageConfig) -> Grey:
+def with_contrast(image: Grey) -> Grey:
     """Normalise the local contrast of an ``(H, W)`` uint8 image.
 
     The image is blurred by one pixel. Then the grey values are scaled so that the window around
@@ -169,10 +191,10 @@ def with_contrast(image: Grey, config: WeakImageConfig) -> Grey:
     only noise, are amplified less.
     """
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
-    window = (config.contrast_window, config.contrast_window)
+    window = (_CONTRAST_WINDOW, _CONTRAST_WINDOW)
     mean = cv2.boxFilter(smooth, -1, window)
     variance = cv2.boxFilter(smooth * smooth, -1, window) - mean * mean
     deviation = cv2.boxFilter(np.sqrt(np.maximum(variance, 0.0)), -1, window)
-    least = max(config.least_contrast, config.flat_share * float(np.median(deviation)))
-    raised = 128.0 + (smooth - mean) * (config.raised_contrast / np.maximum(deviation, least))
+    least = max(_LEAST_CONTRAST, _FLAT_SHARE * float(np.median(deviation)))
+    raised = 128.0 + (smooth - mean) * (_RAISED_CONTRAST / np.maximum(deviation, least))
     return np.clip(np.rint(raised), 0, 255).astype(np.uint8)

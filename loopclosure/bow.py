@@ -25,6 +25,17 @@ from vslam.types.loops import DetectorMemory, LoopCandidate, PerKeyframe
 from vslam.types.map import Map
 from vslam.types.map_kernels import count_shared
 
+# The number of words that a candidate shares with the query must be at least this fraction of the
+# largest number that any keyframe shares with the query. [OS1 III-E, customary]
+_COMMON_WORDS_RATIO = 0.8
+# A group is kept if its score is at least this fraction of the score of the best group. [OS1
+# III-E, printed]
+_GROUP_SCORE_RATIO = 0.75
+# Two keyframes are neighbours if they share at least this many landmarks. The neighbours of the
+# query are never candidates. A candidate must have at least the lowest score of these neighbours.
+# [OS1 III-D, printed]
+_MIN_SHARED = 15
+
 
 class BowDetector:
     """A ``LoopDetector`` that compares images using bags of visual words."""
@@ -67,7 +78,7 @@ class BowDetector:
         n = len(likeness.score)
         eligible = map_.arrays.keyframe_alive[:n].copy()
         eligible[max(0, keyframe + 1 - config.exclude_recent) :] = False
-        covisible, _ = map_.covisible(keyframe, config.min_shared)
+        covisible, _ = map_.covisible(keyframe, _MIN_SHARED)
         covisible = covisible[(covisible < n) & (covisible != keyframe)]
         eligible[covisible] = False
         with_words = covisible[np.diff(self._start[: n + 1])[covisible] > 0]
@@ -134,10 +145,10 @@ class BowDetector:
             likeness.score,
             eligible,
             least_score,
-            config.common_words_ratio,
+            _COMMON_WORDS_RATIO,
             config.group_size,
-            config.min_shared,
-            config.group_score_ratio,
+            _MIN_SHARED,
+            _GROUP_SCORE_RATIO,
             config.max_groups,
         )
         return [

@@ -26,6 +26,16 @@ from vslam.types.loops import LoopCandidate, LoopEdge, ResembledPlace
 from vslam.types.map import Map
 from vslam.types.states import ConsistencyState
 
+# Each verified loop implies a pose of the query. Two loops agree if these positions are at most
+# this far apart, in metres. [own]
+_MAX_APART = 0.5
+# Two loops agree only if the orientations of the query that they imply differ by at most this
+# value, in degrees. [own]
+_MAX_TURN = 1.0
+# Keyframes that share at least this many landmarks with a candidate belong to the same place.
+# [own]
+MIN_SHARED = 30
+
 
 class LoopConsistency:
     """Tests the temporal consistency of loops.
@@ -56,7 +66,7 @@ class LoopConsistency:
         consistent, rejected = [], []
         continued: set[int] = set()
         for candidate in candidates:
-            around = map_.covisible(candidate.match, self.config.min_shared)[0].tolist()
+            around = map_.covisible(candidate.match, MIN_SHARED)[0].tolist()
             place = frozenset({candidate.match, *around})
             overlapping = [
                 i for i, one in enumerate(self._series) if not place.isdisjoint(one.keyframes)
@@ -184,8 +194,8 @@ class LoopConsistency:
         twist = se3_log(inverse(_rigid(a)) @ _rigid(b))
         difference = (a[:3, :3] - b[:3, :3]) @ position + a[:3, 3] - b[:3, 3]
         return bool(
-            np.linalg.norm(difference) <= self.config.max_apart
-            and np.degrees(np.linalg.norm(twist[3:])) <= self.config.max_turn
+            np.linalg.norm(difference) <= _MAX_APART
+            and np.degrees(np.linalg.norm(twist[3:])) <= _MAX_TURN
         )
 
     def state(self) -> ConsistencyState:

@@ -13,10 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import LearnedMatchingConfig
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.pose import optimise_pose, pose_covariance
 from vslam.loopclosure.local_matching import (
+    GUIDED_REACH,
+    MIN_COARSE_SIMILARITY,
+    MIN_FINE_SIMILARITY,
+    REACH,
     DescriptorMaps,
     homography_share,
     locate,
@@ -28,6 +31,23 @@ from vslam.types.camera import Camera
 from vslam.types.geometry import Matrix, transform
 from vslam.types.map import Map
 from vslam.types.reprojection import stack_uvr
+
+# Upper bound of the number of keyframes that are matched at each place. [own]
+_VIEWS = 2
+# At least this fraction of the cells of the network's coarse feature map must agree with one
+# homography. [own]
+_MIN_SHARE = 0.1
+# Standard deviation of the position of a match, in pixels of the network's input image. With a
+# larger value, matches with larger errors count as inliers. [own]
+SIGMA = 1.5
+# Upper bound of the number of RANSAC draws. [own]
+_MAX_DRAWS = 1000
+# The probability with which RANSAC must draw at least one sample without outliers. [own]
+_CONFIDENCE = 0.99
+# RANSAC must find at least this many inliers. [own]
+_MIN_CONSENSUS = 40
+# At least this fraction of the landmarks that are searched for must be inliers of RANSAC. [own]
+_MIN_CONSENSUS_RATIO = 0.15
 
 
 class View(NamedTuple):
@@ -71,7 +91,6 @@ def localise(
     keyframes: list[int],
     images: KeyframeImages,
     camera: Camera,
-    config: LearnedMatchingConfig,
     seed: int,
 ) -> PoseEstimate | str:
     """Estimate the pose of an image at a place of the map, using learned local descriptors.
@@ -87,32 +106,30 @@ def localise(
     views: list[View] = []
     xyz, uv = np.empty((0, 3)), np.empty((0, 2))
     n_searched, reason = 0, ""
-    for keyframe in keyframes[: config.views]:
+    for keyframe in keyframes[:_VIEWS]:
         view = view_of(map_, keyframe, images)
-        coarse = match_coarse(view.maps, query, config.min_coarse_similarity)
+        coarse = match_coarse(view.maps, query, MIN_COARSE_SIMILARITY)
         share = homography_share(coarse, view.maps, query)
-        if share < config.min_share:
+        if share < _MIN_SHARE:
             return reason or f"only {100 * share:.0f} % of the image matches"
         views.append(view)
         n_searched += len(view.xy)
-        min_inliers = max(config.min_consensus, round(config.min_consensus_ratio * n_searched))
-        located = locate(
-            view.xy, view.maps, query, coarse, config.reach, config.min_fine_similarity
-        )
+        min_inliers = max(_MIN_CONSENSUS, round(_MIN_CONSENSUS_RATIO * n_searched))
+        located = locate(view.xy, view.maps, query, coarse, REACH, MIN_FINE_SIMILARITY)
         found = located.found
         xyz = np.vstack([xyz, map_.arrays.xyz[view.landmarks[found]]])
         uv = np.vstack([uv, located.xy[found]])
         T_cw, inlier = ransac_pose(
             xyz,
-            *_observed(uv, query, config),
+            *_observed(uv, query),
             camera.intrinsics,
             np.uint64(seed),
             min_inliers,
-            config.max_draws,
-            config.confidence,
+            _MAX_DRAWS,
+            _CONFIDENCE,
         )
         if np.count_nonzero(inlier) >= min_inliers:
-            return guided_search(map_, views, T_cw, query, camera, config)
+            return guided_search(map_, views, T_cw, query, camera)
         reason = f"no pose has {min_inliers} inliers among {len(uv)} learned matches"
     return reason or "no image of the place is stored"
 
@@ -130,7 +147,6 @@ def guided_search(
     T_cw: Matrix,
     query: DescriptorMaps,
     camera: Camera,
-    config: LearnedMatchingConfig,
 ) -> PoseEstimate:
     """Refine the pose of an image. The landmarks of ``views`` are searched for near their
     projections, and the pose is optimised with all matches. Both steps are done twice."""
@@ -144,11 +160,11 @@ def guided_search(
         for view in views:
             chosen = np.flatnonzero((first >= start) & (first < start + len(view.landmarks)))
             xy = view.xy[first[chosen] - start]
-            least, reach = config.min_fine_similarity, config.guided_reach
+            least, reach = MIN_FINE_SIMILARITY, GUIDED_REACH
             found[chosen] = locate_near(xy, expected[chosen], view.maps, query, reach, least).xy
             start += len(view.landmarks)
         hit = np.flatnonzero(np.isfinite(found[:, 0]))
-        observed = _observed(found[hit], query, config)
+        observed = _observed(found[hit], query)
         T_cw, inlier = optimise_pose(T_cw, xyz[hit], *observed, camera.intrinsics)
     covariance = pose_covariance(
         T_cw,
@@ -179,13 +195,11 @@ def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
     return uv
 
 
-def _observed(
-    uv: Matrix, query: DescriptorMaps, config: LearnedMatchingConfig
-) -> tuple[Matrix, Matrix]:
+def _observed(uv: Matrix, query: DescriptorMaps) -> tuple[Matrix, Matrix]:
     """Convert ``(N, 2)`` pixels to monocular observations.
 
     Returns:
         ``(N, 3)`` u, v, u_right, where u_right is NaN, and ``(N,)`` inverse variances of u and v.
     """
-    sigma = config.sigma / query.scale
+    sigma = SIGMA / query.scale
     return stack_uvr(uv, np.full(len(uv), np.nan)), np.full(len(uv), sigma**-2.0)

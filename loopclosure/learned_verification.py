@@ -16,8 +16,15 @@ from numpy.typing import NDArray
 from vslam.config import Config, LearnedMatchingConfig, VerificationConfig
 from vslam.loopclosure.evidence import evidence_of, probability_wrong, weighed
 from vslam.loopclosure.learned_alignment import aligned
-from vslam.loopclosure.learned_localisation import PoseEstimate, localise, project, view_of
-from vslam.loopclosure.local_matching import DescriptorMaps, likeness, locate_near
+from vslam.loopclosure.learned_localisation import SIGMA, PoseEstimate, localise, project, view_of
+from vslam.loopclosure.local_matching import (
+    GUIDED_REACH,
+    MIN_COARSE_SIMILARITY,
+    MIN_FINE_SIMILARITY,
+    DescriptorMaps,
+    likeness,
+    locate_near,
+)
 from vslam.loopclosure.reach import within_reach
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verification import (
@@ -32,6 +39,10 @@ from vslam.types.geometry import inverse, orthonormalised, transform
 from vslam.types.loops import LastSeen, Localisation, LoopCandidate, LoopEdge, LoopEvidence
 from vslam.types.map import Map
 from vslam.types.map_kernels import collect_landmarks
+
+# A keypoint can observe a matched landmark only if it lies within this distance of the landmark's
+# projection, in pixels at octave 0. [own]
+_FUSE_PIXELS = 2.0
 
 # A lost frame is not recognised if its pose is wrong with a larger probability. Between different
 # places that look alike, the smallest probability in 15 rendered drives is 0.9.
@@ -66,7 +77,7 @@ def with_similarities(
         return list(candidates)
     query = glance()
     similarity = {
-        match: likeness(query, images.glance(match), config.min_coarse_similarity)
+        match: likeness(query, images.glance(match), MIN_COARSE_SIMILARITY)
         for match in unknown[: config.max_compared]
     }
     return [
@@ -107,22 +118,22 @@ def verify_learned(
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate, matched_by="learned")
-    keyframes = [k for k in place_of(map_, match, query, gates).tolist() if k in images]
+    keyframes = [k for k in place_of(map_, match, query).tolist() if k in images]
     if query not in images or not keyframes:
         return replace(edge, reason="no image is stored")
     maps = images.maps(query)
-    estimate = localise(map_, maps, keyframes, images, camera, config, seed=query << 32 | match)
+    estimate = localise(map_, maps, keyframes, images, camera, seed=query << 32 | match)
     if isinstance(estimate, str):
         return replace(edge, reason=estimate)
     learned = estimate
     refined = aligned(map_, query, keyframes, learned, images, camera, gates.min_inliers)
     if refined is not None:
         estimate = refined
-    feature, landmark = observed_features(map_, query, estimate, camera, config)
+    feature, landmark = observed_features(map_, query, estimate, camera)
     # Now that the pose is known, ORB features may match. Their pairs of features and landmarks are
     # preferred, and their pose if too few patches could be aligned.
     place = collect_landmarks(map_.arrays, np.array(keyframes, np.int64), map_.n_landmarks)
-    guided = guided_match(map_, query, place, estimate.T_cw, camera, gates)
+    guided = guided_match(map_, query, place, estimate.T_cw, camera)
     if np.count_nonzero(guided.seen) >= gates.min_inliers:
         if refined is None:
             estimate = estimate._replace(T_cw=guided.T_cw, covariance=guided.covariance)
@@ -147,7 +158,7 @@ def verify_learned(
         return replace(edge, reason=reason)
     if edge.n_inliers < config.min_inliers:
         return replace(edge, reason=f"only {edge.n_inliers} learned matches fit")
-    seen_of_query = _seen_of_query(map_, edge, keyframes[0], images, camera, config)
+    seen_of_query = _seen_of_query(map_, edge, keyframes[0], images, camera)
     return weighed(edge, _evidence_of(map_, learned, camera, maps.scale, seen_of_query))
 
 
@@ -174,7 +185,7 @@ def recognise(
     """
     around = [match, *map_.covisible(match)[0].tolist()]
     keyframes = [k for k in around if k in images]
-    estimate = localise(map_, query, keyframes, images, camera, config.learned, seed=match)
+    estimate = localise(map_, query, keyframes, images, camera, seed=match)
     if isinstance(estimate, str):
         return None
     index = np.flatnonzero(estimate.seen)
@@ -186,7 +197,7 @@ def recognise(
     if probability_wrong(evidence, "learned") > _MAX_WRONG_POSE:
         return None
     feature, near = nearest_features(
-        estimate.uv[index], features.xy, features.octave, map_.scales, config.learned.fuse_pixels
+        estimate.uv[index], features.xy, features.octave, map_.scales, _FUSE_PIXELS
     )
     if len(feature) < config.tracking.min_inliers:
         return None
@@ -194,7 +205,7 @@ def recognise(
 
 
 def observed_features(
-    map_: Map, query: int, estimate: PoseEstimate, camera: Camera, config: LearnedMatchingConfig
+    map_: Map, query: int, estimate: PoseEstimate, camera: Camera
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Pair features of the query image with landmarks at the same image position. The image
     positions of landmarks are predicted from the estimated pose.
@@ -207,9 +218,7 @@ def observed_features(
     """
     a, rows = map_.arrays, map_.rows(query)
     landmarks, uv = estimate.landmarks[estimate.seen], estimate.uv[estimate.seen]
-    feature, index = nearest_features(
-        uv, a.xy[rows], a.octave[rows], map_.scales, config.fuse_pixels
-    )
+    feature, index = nearest_features(uv, a.xy[rows], a.octave[rows], map_.scales, _FUSE_PIXELS)
     own = a.landmark[rows][feature]
     depth = transform(estimate.T_cw, a.xyz[landmarks[index]])[:, 2]
     ratio = np.where(own >= 0, transform(a.T_cw[query], a.xyz[own])[:, 2] / depth, np.nan)
@@ -256,7 +265,6 @@ def _seen_of_query(
     keyframe: int,
     images: KeyframeImages,
     camera: Camera,
-    config: LearnedMatchingConfig,
 ) -> tuple[int, int]:
     """Return how many landmarks of the query are found at their projections in the image of a
     keyframe, and how many should be visible in this image."""
@@ -271,11 +279,11 @@ def _seen_of_query(
     T_kw = inverse(T_wk) @ T_wm @ T_match_query @ map_.keyframe_pose(edge.query)
     expected = project(map_.arrays.xyz[view.landmarks], T_kw, camera)
     match = images.maps(keyframe)
-    least, reach = config.min_fine_similarity, config.guided_reach
+    least, reach = MIN_FINE_SIMILARITY, GUIDED_REACH
     found = locate_near(view.xy, expected, view.maps, match, reach, least)
     error = np.linalg.norm(found.xy - expected, axis=1) * match.scale
     # For a two-dimensional normal distribution, 95 % of the distances are below 2.45 sigma.
-    seen = np.count_nonzero(error < 2.45 * config.sigma)
+    seen = np.count_nonzero(error < 2.45 * SIGMA)
     return int(seen), int(np.isfinite(expected[:, 0]).sum())
 
 

@@ -16,6 +16,17 @@ from numpy.typing import NDArray
 
 from vslam.support.kernels import inner_kernel, kernel
 
+# Two coarse descriptors match only if their cosine is at least this value. [own]
+MIN_COARSE_SIMILARITY = 0.3
+# Two fine descriptors match only if their cosine is at least this value. [own]
+MIN_FINE_SIMILARITY = 0.5
+# The fine match is searched for up to this distance to each side of the coarse match, in cells of
+# the network's fine feature map. [own]
+REACH = 5
+# A landmark is searched for up to this distance to each side of its projection, in cells of the
+# network's fine feature map. [own]
+GUIDED_REACH = 3
+
 COARSE_STRIDE, FINE_STRIDE = 16, 4  # pixels of the network's input per cell
 _HOMOGRAPHY_PIXELS = 12.0  # RANSAC threshold, pixels of the network's input
 _HOMOGRAPHY_DRAWS = 300  # maximum number of RANSAC samples

@@ -38,6 +38,29 @@ from vslam.types.map import Map
 from vslam.types.map_kernels import collect_landmarks
 from vslam.types.reprojection import stack_uvr
 
+# Upper bound of the descriptor distance of a match, in bits. [OS1 VII-B, customary]
+MATCH_DISTANCE = 50
+# Upper bound of the ratio of the best to the second-best distance. [OS1 VII-B, own]
+MATCH_RATIO = 0.8
+# At least this many landmarks must be matched by descriptor. [OS1 VII-B, customary]
+_MIN_MATCHES = 20
+# Upper bound of the number of RANSAC draws. [OS1 VII-B, own]
+_MAX_DRAWS = 600
+# The probability with which RANSAC must draw at least one sample without outliers. [OS1 VII-B,
+# own]
+_CONFIDENCE = 0.99
+# RANSAC must find at least this many inliers. [OS1 VII-B, own]
+_MIN_CONSENSUS = 15
+# The landmarks of the matched keyframe and of this many covisible keyframes form the place that
+# guided search looks for. [own]
+_PLACE_KEYFRAMES = 10
+# Search radius of the first guided search, in pixels at octave 0. [OS1 VII-B, own]
+_FIRST_WINDOW = 8.0
+# Search radius of the second guided search, in pixels at octave 0. [OS1 VII-B, own]
+_SECOND_WINDOW = 4.0
+# Upper bound of the descriptor distance in guided search, in bits. [OS1 VII-B, own]
+_GUIDED_DISTANCE = 64
+
 MIN_DEPTHS = 10  # least number of features with landmarks on both sides to estimate the scale
 
 
@@ -84,16 +107,14 @@ def verify(
     """
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate)
-    rows_q, rows_m = match_keyframes(map_, query, match, config)
+    rows_q, rows_m = match_keyframes(map_, query, match)
     edge = replace(edge, n_matches=len(rows_q))
-    if len(rows_q) < config.min_matches:
+    if len(rows_q) < _MIN_MATCHES:
         return replace(edge, reason=f"only {len(rows_q)} descriptors match")
 
-    T_query_match, scale, n_inliers = _consensus(map_, query, match, rows_q, rows_m, camera, config)
+    T_query_match, scale, n_inliers = _consensus(map_, query, match, rows_q, rows_m, camera)
     if T_query_match is None:
-        return replace(
-            edge, reason=f"no motion has {config.min_consensus} inliers among the matches"
-        )
+        return replace(edge, reason=f"no motion has {_MIN_CONSENSUS} inliers among the matches")
     edge = replace(edge, n_inliers=n_inliers, T_query_match=T_query_match, scale=scale)
     return verify_near(map_, edge, camera, config)
 
@@ -107,10 +128,10 @@ def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationC
     """
     if edge.T_query_match is None:
         raise ValueError(f"the edge from {edge.query} to {edge.match} has no pose")
-    place = place_of(map_, edge.match, edge.query, config)
+    place = place_of(map_, edge.match, edge.query)
     T_mw = map_.keyframe_pose(edge.match)
     landmarks = collect_landmarks(map_.arrays, place, map_.n_landmarks)
-    guided = guided_match(map_, edge.query, landmarks, edge.T_query_match @ T_mw, camera, config)
+    guided = guided_match(map_, edge.query, landmarks, edge.T_query_match @ T_mw, camera)
     T_query_match = orthonormalised(guided.T_cw @ inverse(T_mw))
     edge = replace(
         edge,
@@ -138,13 +159,13 @@ def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationC
         camera.intrinsics[0],
         camera.width,
         seen_of(map_, edge.match, guided),
-        seen_of(map_, edge.query, reverse_match(map_, edge, camera, config)),
+        seen_of(map_, edge.query, reverse_match(map_, edge, camera)),
     )
     return weighed(edge, evidence)
 
 
 def match_keyframes(
-    map_: Map, query: int, match: int, config: VerificationConfig
+    map_: Map, query: int, match: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Match the descriptors of two keyframes. Features without a landmark are not used.
 
@@ -156,9 +177,7 @@ def match_keyframes(
     rows_q, rows_m = (
         np.flatnonzero(a.landmark[map_.rows(k)] >= 0) + a.first_row[k] for k in (query, match)
     )
-    found = search_all(
-        a.descriptor[rows_q], a.descriptor[rows_m], config.match_distance, config.match_ratio
-    )
+    found = search_all(a.descriptor[rows_q], a.descriptor[rows_m], MATCH_DISTANCE, MATCH_RATIO)
     hit = np.flatnonzero(found >= 0)
     rows_q, rows_m = rows_q[hit], rows_m[found[hit]]
     keep = consistent_orientation(a.angle[rows_q], a.angle[rows_m])
@@ -172,7 +191,6 @@ def _consensus(
     rows_q: NDArray[np.int64],
     rows_m: NDArray[np.int64],
     camera: Camera,
-    config: VerificationConfig,
 ) -> tuple[Matrix | None, float, int]:
     """Estimate the motion between two keyframes using RANSAC.
 
@@ -185,9 +203,9 @@ def _consensus(
         _observed_points(map_, match, rows_m),
         camera.intrinsics,
         seed=query << 32 | match,
-        min_inliers=config.min_consensus,
-        max_draws=config.max_draws,
-        confidence=config.confidence,
+        min_inliers=_MIN_CONSENSUS,
+        max_draws=_MAX_DRAWS,
+        confidence=_CONFIDENCE,
         fix_scale=not camera.monocular,
     )
     if found is None:
@@ -236,12 +254,12 @@ def _observations(map_: Map, rows: NDArray[np.int64]) -> tuple[Matrix, Matrix]:
     return uvr, map_.scales[a.octave[rows]] ** -2.0
 
 
-def place_of(map_: Map, match: int, query: int, config: VerificationConfig) -> NDArray[np.int64]:
+def place_of(map_: Map, match: int, query: int) -> NDArray[np.int64]:
     """Return the ids of the match keyframe and its most covisible keyframes. Keyframes that are
     covisible with the query keyframe are excluded."""
     near_query = {query, *map_.covisible(query)[0].tolist()}
     around = [k for k in map_.covisible(match)[0].tolist() if k not in near_query]
-    return np.array([match, *around[: config.place_keyframes]], np.int64)
+    return np.array([match, *around[:_PLACE_KEYFRAMES]], np.int64)
 
 
 def guided_match(
@@ -250,7 +268,6 @@ def guided_match(
     landmarks: NDArray[np.int32],
     T_cw: Matrix,
     camera: Camera,
-    config: VerificationConfig,
 ) -> GuidedMatches:
     """Match ``(N,)`` landmarks with the features of a keyframe, and refine the pose of the
     keyframe.
@@ -267,7 +284,7 @@ def guided_match(
     grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
     features = Searchable(a.xy[rows], a.octave[rows], a.u_right[rows], a.descriptor[rows], grid)
     free = np.ones(rows.stop - rows.start, np.bool_)
-    for window in (config.first_window, config.second_window):
+    for window in (_FIRST_WINDOW, _SECOND_WINDOW):
         expected, radius, octave = predict_view(
             T_cw,
             a.xyz[landmarks],
@@ -283,7 +300,7 @@ def guided_match(
             Projections(expected, radius, octave - 1, octave + 1, a.landmark_descriptor[landmarks]),
             features,
             free,
-            config.guided_distance,
+            _GUIDED_DISTANCE,
             1.0,
         )
         hit = np.flatnonzero(found >= 0)
@@ -313,14 +330,13 @@ def reverse_match(
     map_: Map,
     edge: LoopEdge,
     camera: Camera,
-    config: VerificationConfig,
 ) -> GuidedMatches:
     """Search for the landmarks of a loop's query keyframe in the image of its match keyframe."""
     assert edge.T_query_match is not None
     T_match_query = inverse(edge.T_query_match)
     T_match_query[:3, 3] *= edge.scale  # lengths in the unit around the query, like the landmarks
     T_mw = T_match_query @ map_.keyframe_pose(edge.query)
-    return guided_match(map_, edge.match, map_.landmarks_of(edge.query), T_mw, camera, config)
+    return guided_match(map_, edge.match, map_.landmarks_of(edge.query), T_mw, camera)
 
 
 def seen_of(map_: Map, keyframe: int, guided: GuidedMatches) -> tuple[int, int]:

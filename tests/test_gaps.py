@@ -14,6 +14,7 @@ from test_closing import EXACT, ROUND, run
 from test_report import make_outcome
 from typer.testing import CliRunner
 
+from vslam.backend.similarity_graph import GAP_SCALE
 from vslam.cli.main import app
 from vslam.method.gaps import Gap, GapKind, sentences
 from vslam.report.folder import write_results
@@ -109,7 +110,7 @@ def test_the_scale_after_a_gap_is_predicted_too():
     slam, _ = test_monocular.run(ROUND[:70], dark=range(35, 45))
     (gap,) = slam.gaps()
     assert gap.kind is GapKind.PREDICTED
-    assert gap.scale == pytest.approx(np.exp(slam.context.config.pose_graph.gap_scale))
+    assert gap.scale == pytest.approx(np.exp(GAP_SCALE))
     (said,) = sentences([gap], 70, "map units")
     assert "map units" in said
     assert "the scale by a factor of 1.35" in said

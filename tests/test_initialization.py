@@ -56,7 +56,7 @@ def turn_deg(R_a, R_b):
 @pytest.mark.parametrize(("kind", "model"), [("wall", "homography"), ("volume", "fundamental")])
 def test_the_model_that_explains_the_scene_is_selected(kind, model, motion, outliers):
     xy_1, xy_2, right = views(scene(kind), motion, outliers=outliers)
-    found = select_model(xy_1, xy_2, np.ones(len(xy_1)), CONFIG, seed=1)
+    found = select_model(xy_1, xy_2, np.ones(len(xy_1)), seed=1)
     assert found.kind == model
     assert np.count_nonzero(found.inlier & right) > 0.85 * np.count_nonzero(right)
     if outliers:
@@ -66,7 +66,7 @@ def test_the_model_that_explains_the_scene_is_selected(kind, model, motion, outl
 def test_a_camera_that_only_turns_makes_a_homography_and_no_map():
     turn = se3_exp(np.array([0.0, 0.0, 0.0, 0.02, 0.1, 0.01]))
     xy_1, xy_2, _ = views(scene("volume"), turn)
-    assert select_model(xy_1, xy_2, np.ones(len(xy_1)), CONFIG, seed=1).kind == "homography"
+    assert select_model(xy_1, xy_2, np.ones(len(xy_1)), seed=1).kind == "homography"
     assert reconstruct(xy_1, xy_2, np.ones(len(xy_1)), CAMERA, CONFIG, seed=1) is None
 
 
@@ -113,7 +113,7 @@ def test_motion_and_points_of_a_volume_with_wrong_matches(motion):
 def test_a_wall_leaves_two_motions_and_none_is_taken():
     far_aside = se3_exp(np.array([-2.5, 0.1, 0.5, 0.01, -0.2, 0.02]))
     xy_1, xy_2, _ = views(scene("wall", 400), far_aside, noise=0.2, outliers=0.2)
-    assert select_model(xy_1, xy_2, np.ones(400), CONFIG, seed=1).kind == "homography"
+    assert select_model(xy_1, xy_2, np.ones(400), seed=1).kind == "homography"
     assert reconstruct(xy_1, xy_2, np.ones(400), CAMERA, CONFIG, seed=1) is None
 
 
@@ -122,7 +122,7 @@ def test_motion_along_a_floor():
     aside = se3_exp(np.array([-1.0, 0.0, 0.1, 0.0, 0.1, 0.0]))
     points = scene("floor", 400)
     xy_1, xy_2, right = views(points, aside, noise=0.2, outliers=0.2)
-    assert select_model(xy_1, xy_2, np.ones(400), CONFIG, seed=1).kind == "homography"
+    assert select_model(xy_1, xy_2, np.ones(400), seed=1).kind == "homography"
     found = reconstruct(xy_1, xy_2, np.ones(400), CAMERA, CONFIG, seed=1)
     assert found is not None
     assert turn_deg(found.T_2_1[:3, :3], aside[:3, :3]) < 0.2

@@ -98,8 +98,8 @@ def test_where_keyframes_bring_few_close_points_losing_most_of_those_makes_one()
 def test_that_close_points_are_few_by_nature_takes_several_keyframes_to_show():
     state, means = policy().state, []
     for _ in range(6):
-        state = count_close(replace(state, gain_awaited=True), 50, 1, CONFIG)
-        state = count_close(state, 3, 2, CONFIG)  # later frames do not count
+        state = count_close(replace(state, gain_awaited=True), 50, 1)
+        state = count_close(state, 3, 2)  # later frames do not count
         means.append(state.gained_close)
     np.testing.assert_allclose(means, 50 + 150 * 0.8 ** np.arange(1, 7), rtol=1e-12)
     assert [mean < 100 for mean in means] == [False] * 4 + [True] * 2

@@ -100,9 +100,6 @@ def test_a_map_is_continued_with_the_thresholds_that_it_was_made_with(tmp_path):
     assert Slam.load(file, {}, threads=1).context.config == Config()
     again.save(file)
     assert made_with(file).thresholds == {"orb.n_features": 900}
-    write_header(file, thresholds={"verification.descriptors": "usual", "learned.rest": 3})
-    older = Slam.load(file, threads=1).context.config  # with the names of an earlier version
-    assert (older.verification.descriptors, older.learned.retry_interval) == ("auto", 3)
     write_header(file, thresholds={"orb.retired": 3})
     with pytest.raises(InputError, match=r"map.npz: orb.retired: unknown key"):
         Slam.load(file)

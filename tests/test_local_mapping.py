@@ -203,7 +203,7 @@ def triangulate(world: World, k1: int, k2: int):
         SCALES,
         CAMERA.baseline,
         CONFIG.mapping.epipolar_distance,
-        CONFIG.mapping.min_parallax_cosine,
+        0.9998,
     )
 
 
@@ -451,7 +451,7 @@ def test_landmarks_on_probation_are_culled_by_the_letter():
         link_many(map_.arrays, np.array(rows), np.full(observers, landmark))
         map_.arrays.visible[landmark], map_.arrays.found[landmark] = visible, found
         survivors += [landmark] if survives else []
-    cull_recent_landmarks(map_, 6, CAMERA, CONFIG)
+    cull_recent_landmarks(map_, 6, CAMERA)
     assert map_.living_landmarks().tolist() == survivors
 
 

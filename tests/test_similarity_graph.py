@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from ring import CAMERA
 
-from vslam.backend.pose_graph import GAP, LOOP, TREE, WEAK, PoseGraph, edge_sigmas
+from vslam.backend.pose_graph import _MIN_LENGTH, GAP, LOOP, TREE, WEAK, PoseGraph, edge_sigmas
 from vslam.backend.similarity_graph import (
+    _LOOP_SCALE,
+    _SCALE_DRIFT,
     check_similarity_graph,
     edge_errors,
     loop_in_new_units,
@@ -69,8 +71,8 @@ def test_scale_alone_spreads_by_the_variances():
     config = CONFIG.model_copy(update={"robust_scale": 1e3})  # Gaussian, for the closed form
     graph = chain(np.tile(np.eye(4), (n, 1, 1)), np.eye(4), np.exp(drift))
     found = optimise_similarities(graph, inverses(graph.T_cw), config)
-    edge = CONFIG.scale_drift**2 * CONFIG.min_length
-    share = edge / ((n - 1) * edge + CONFIG.loop_scale**2)
+    edge = _SCALE_DRIFT**2 * _MIN_LENGTH
+    share = edge / ((n - 1) * edge + _LOOP_SCALE**2)
     np.testing.assert_allclose(np.log(scale_of(found)), drift * share * np.arange(n), atol=1e-7)
     np.testing.assert_allclose(found[:, :3, 3], 0.0, atol=1e-7)
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from parts import InstantWorkers
 
+from vslam.backend import local_mapping
 from vslam.backend.local_mapping import local_window
-from vslam.config import Config, KeyframeConfig, MappingConfig, OrbConfig, TrackingConfig
+from vslam.config import Config, KeyframeConfig, OrbConfig, TrackingConfig
 from vslam.datasets.kitti import open_kitti
 from vslam.loopclosure.detector import NoDetector
 from vslam.slam import Slam
@@ -468,14 +469,14 @@ def test_the_kitti_tree_is_read_as_it_was_rendered(kitti_tree, corridor):
     assert len(sequence.ground_truth) == len(corridor)
 
 
-def test_a_part_of_the_map_that_began_anew_is_held_by_its_oldest_keyframe(corridor):
+def test_a_part_of_the_map_that_began_anew_is_held_by_its_oldest_keyframe(corridor, monkeypatch):
     """Otherwise, bundle adjustment could move the whole part freely."""
     slam, _ = run(corridor)
     detach_keyframe(slam.map.arrays, 0)
     anew = [int(k) for k in slam.map.living_keyframes() if k != 0]
     assert len(anew) >= 3
-    everything = Config(mapping=MappingConfig(min_shared=1))
-    free, fixed, _ = local_window(slam.map, anew[-1], everything)
+    monkeypatch.setattr(local_mapping, "MIN_SHARED", 1)
+    free, fixed, _ = local_window(slam.map, anew[-1], Config())
     assert fixed.tolist() == anew[:1]
     assert free.tolist() == anew[1:]
 

@@ -7,6 +7,7 @@ import pytest
 from parts import ALL, CAMERA, Points, frame_of
 
 from vslam.config import Config
+from vslam.frontend import initialization
 from vslam.frontend.track import Track
 from vslam.method.starter import Starter, TwoViewStart
 from vslam.types.context import Context
@@ -86,12 +87,13 @@ def test_a_view_that_has_waited_too_long_is_replaced(seconds, together):
 
 
 @pytest.mark.parametrize(("n_common", "together"), [(100, True), (99, False)])
-def test_a_view_that_shows_too_little_of_the_first_one_replaces_it(n_common, together):
+def test_a_view_that_shows_too_little_of_the_first_one_replaces_it(n_common, together, monkeypatch):
     """Each view shows at least 200 of 240 points.
 
     Its other points look unlike those in the first view.
     """
-    one, second = starter(min_landmarks=50, min_points=20), frame(1, 0.1, 1.0)
+    monkeypatch.setattr(initialization, "_MIN_POINTS", 20)
+    one, second = starter(min_landmarks=50), frame(1, 0.1, 1.0)
     strange = np.random.default_rng(1).integers(0, 256, (240 - n_common, 32), dtype=np.uint8)
     second.features.descriptors[:] = np.vstack([POINTS.descriptors[:n_common], strange])
     one.offer(frame(0, 0.0), None)

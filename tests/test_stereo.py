@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vslam.config import OrbConfig, StereoConfig
+from vslam.config import OrbConfig
 from vslam.frontend.orb import Extraction, extract
 from vslam.frontend.stereo import inliers_only, match_stereo, rows_to_features, slide
 from vslam.types.camera import Camera
@@ -43,7 +43,7 @@ def match(
     left = extracted(image + noise * rng.normal(size=image.shape))
     right = extracted(shifted(image, dx, dy) + noise * rng.normal(size=image.shape))
     camera = Camera(fx, fx, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
-    u_right = inliers_only(match_stereo(left, right, camera, StereoConfig()), left.octave)
+    u_right = inliers_only(match_stereo(left, right, camera), left.octave)
     assert u_right.dtype == np.float32
     return left, left.xy[:, 0] - u_right
 
@@ -118,15 +118,15 @@ def test_rows_that_do_not_correspond_match_rarely():
 def test_strangers_match_rarely():
     left, right = extracted(texture(0)), extracted(texture(1))
     camera = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
-    matched = np.isfinite(match_stereo(left, right, camera, StereoConfig()).u_right)
+    matched = np.isfinite(match_stereo(left, right, camera).u_right)
     assert np.count_nonzero(matched) < 0.05 * len(matched)
 
 
 def test_an_empty_image_matches_nothing():
     left, black = extracted(texture()), extracted(np.zeros((HEIGHT, WIDTH)))
     camera = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)
-    assert np.isnan(match_stereo(left, black, camera, StereoConfig()).u_right).all()
-    assert match_stereo(black, left, camera, StereoConfig()).u_right.shape == (0,)
+    assert np.isnan(match_stereo(left, black, camera).u_right).all()
+    assert match_stereo(black, left, camera).u_right.shape == (0,)
 
 
 def test_rows_to_features_lists_each_feature_in_its_band():

@@ -210,7 +210,7 @@ def test_every_gate_says_what_it_missed(change, reason):
 def test_both_sides_of_a_revisit_see_each_other():
     world = street()
     edge = check(world)
-    found = reverse_match(world.map, edge, CAMERA, CONFIG)
+    found = reverse_match(world.map, edge, CAMERA)
     assert np.mean(found.seen) > 0.7
     np.testing.assert_allclose(
         found.T_cw @ inverse(world.map.keyframe_pose(6)), inverse(edge.T_query_match), atol=0.03
@@ -221,7 +221,7 @@ def test_a_keyframe_finds_the_landmarks_it_sees():
     world = street()
     landmarks = world.map.landmarks_of(1)
     start = se3_exp(np.array([0.05, 0.0, 0.05, 0.0, 0.004, 0.0])) @ world.map.keyframe_pose(1)
-    found = guided_match(world.map, 1, landmarks, start, CAMERA, CONFIG)
+    found = guided_match(world.map, 1, landmarks, start, CAMERA)
     assert np.mean(found.seen) > 0.9
     assert np.abs(se3_log(found.T_cw @ inverse(world.truth[1]))).max() < 0.02
     rows = world.map.arrays.first_row[1] + found.feature[found.seen]

@@ -43,7 +43,7 @@ OS1 is Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2 is Mur-Artal and Tardós, ORB-
 
 Descriptor distances are upper bounds. A descriptor has 256 bits. Ratios of the best to the second-best distance are upper bounds, too. A search radius at octave 0 grows with the scale of the pyramid level.
 
-The other numbers of the method are constants in the code. They are mathematical constants, numerical tolerances, sizes of arrays and kernels, and numbers that belong to another constant or to trained weights. The most important ones are:
+What nobody needs to tune is a constant beside the rule that uses it, with its source. They are mathematical constants, numerical tolerances, sizes of arrays and kernels, and numbers that belong to another constant or to trained weights. The most important ones are:
 
 - the chi-square quantiles,
 - the limit of 60 degrees for the viewing angle of a landmark (OS1 V-D),

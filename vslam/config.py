@@ -14,18 +14,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from vslam.support.errors import InputError, did_you_mean, plain_reason
 
 _Model = TypeVar("_Model", bound=BaseModel)
-# Older maps and configurations have other names for some thresholds, by section.
-_RENAMED = {
-    "keyframes": {"merge_after_frames": "publish_after_frames"},
-    "learned": {
-        "rated": "max_compared",
-        "min_alike": "min_similarity",
-        "rest": "retry_interval",
-        "more_alike": "retry_factor",
-        "coarse_alike": "min_coarse_similarity",
-        "alike": "min_fine_similarity",
-    },
-}
 
 
 class Section(BaseModel):
@@ -64,9 +52,6 @@ class OrbConfig(Section):
     fast_threshold_min: int = Field(7, ge=1, le=255)
     """FAST threshold in cells where `fast_threshold` finds no corner, in grey levels.
     [OS1 V-A, customary]"""
-    cell_size: int = Field(35, ge=16)
-    """Side of the square cells in which the FAST threshold adapts, in pixels.
-    [OS1 V-A, customary]"""
 
 
 class WeakImageConfig(Section):
@@ -75,11 +60,6 @@ class WeakImageConfig(Section):
     noise_from: float = Field(5.0, ge=0)
     """An image is blurred if the standard deviation of its noise is at least this value, in grey
     levels. Images without added noise have at most 2.5. [own]"""
-    noise_left: float = Field(4.0, gt=0)
-    """Standard deviation of the noise that should remain after the blur, in grey levels. A smaller
-    value blurs the image more. [own]"""
-    max_blur: float = Field(3.5, gt=0)
-    """Upper bound of the standard deviation of the Gaussian blur, in pixels. [own]"""
     spikes_from: float = Field(0.04, ge=0, le=1)
     """A median filter is applied if more than this fraction of the pixels are spikes. A spike is a
     pixel that is much brighter or much darker than both of its neighbours. [own]"""
@@ -91,41 +71,11 @@ class WeakImageConfig(Section):
     contrast is never raised. To measure the contrast, the image is divided into blocks of 16 x 16
     pixels, and the standard deviation of the grey values is computed for each block. The contrast
     is the median of these standard deviations. [own]"""
-    least_detail: float = Field(0.25, ge=0)
-    """An image counts as out of focus if the mean absolute second difference of its grey values is
-    below this fraction of its contrast. The contrast of such an image is not raised. In sharp
-    images, this ratio is 0.4 or more. [own]"""
-    raised_contrast: float = Field(12.0, gt=0)
-    """Contrast is raised until the grey values in each window have this standard deviation, in grey
-    levels. The default is the contrast of KITTI's images on a bright day. [own]"""
-    contrast_window: int = Field(33, ge=3)
-    """Side of the window in which contrast is raised, in pixels. [own]"""
-    flat_share: float = Field(0.25, gt=0, le=1)
-    """The contrast of a window counts as at least this fraction of the median contrast of all
-    windows. This limits how much the noise in flat parts of the image is amplified. A larger
-    fraction amplifies flat parts less. [own]"""
-    least_contrast: float = Field(0.15, gt=0)
-    """The contrast of a window also counts as at least this value, in grey levels. Rounding alone
-    causes a standard deviation of this size. [own]"""
 
 
 class StereoConfig(Section):
     """Stereo matching [OS2, III-A]."""
 
-    max_descriptor_distance: int = Field(75, ge=0, le=256)
-    """Upper bound of the descriptor distance of a match, in bits. [OS2 III-A, customary]"""
-    sad_window: int = Field(5, ge=1)
-    """Half width of the patch that is compared using the sum of absolute differences (SAD), in
-    pixels of the keypoint's octave. [OS2 III-A, customary]"""
-    sad_search: int = Field(5, ge=1)
-    """The patch is searched for up to this distance to the left and to the right, in pixels of the
-    keypoint's octave. [OS2 III-A, customary]"""
-    balance_from: float = Field(0.3, ge=0)
-    """The darker image of a stereo pair is brightened before stereo matching if the gain between
-    the two images is above this value, in stops (factors of two). [own]"""
-    max_gain_disagreement: float = Field(0.75, gt=0)
-    """A difference in brightness counts as a gain only if the gains of dark and of bright pixels
-    differ by at most this value, in stops. [own]"""
     clipped_from: int = Field(250, ge=1, le=255)
     """A pixel counts as overexposed if its grey level is at least this value. Overexposed pixels
     are ignored when the gain is measured. Video of limited range (16 to 235) needs about 230.
@@ -142,15 +92,6 @@ class StereoConfig(Section):
     """Prior standard deviation of an offset that all disparities have in common, in pixels. The
     offset is estimated from the motion of the camera (docs/research/motorway.md). A larger value
     corrects disparities more. With 0, no offset is estimated. [own]"""
-    offset_keyframes: int = Field(12, ge=3)
-    """The offset is estimated again after this many keyframes. [own]"""
-    least_delay: float = Field(1.2e-3, gt=0)
-    """The report warns if the measured delay of the right camera differs too much from the delay in
-    the calibration. The difference must exceed this value, in seconds, and also `delay_sigmas`
-    (docs/research/stress.md). [own]"""
-    delay_sigmas: float = Field(5.0, gt=0)
-    """The report warns of a delay only if the difference also exceeds this many standard deviations
-    of the measured delay. [own]"""
 
 
 class DepthConfig(Section):
@@ -171,11 +112,6 @@ class DepthConfig(Section):
 class AlignmentConfig(Section):
     """Alignment of matches to sub-pixel accuracy (Forster et al., ICRA 2014, III-B)."""
 
-    iterations: int = Field(7, ge=1)
-    """Upper bound of the number of Gauss-Newton iterations. [own]"""
-    max_shift: float = Field(2.0, gt=0, le=2.0)
-    """Upper bound of the shift between a keypoint and its aligned position, in x and in y, in
-    pixels of its octave. [own]"""
     min_correlation: float = Field(0.85, gt=0, le=1)
     """A match is aligned only if the normalised cross-correlation of its patch with the image is at
     least this value. [own]"""
@@ -200,46 +136,16 @@ class TrackingConfig(Section):
     patch_min_inlier_ratio: float = Field(0.8, ge=0, le=1)
     """Features are extracted for a frame if less than this fraction of its patches agree with its
     pose. This fraction falls below 0.8 among moving vehicles, but not in static scenes. [own]"""
-    patch_fallback_ratio: float = Field(0.5, ge=0, le=1)
-    """If the features of a frame do not match either, its pose is nevertheless found by patches if
-    at least this fraction of the patches agree with it. The frame is then WEAK. [own]"""
     patch_retry_ratio: float = Field(0.86, ge=0, le=1)
     """If less than this fraction of the patches agree with the pose of a frame, the patches are
     searched for a second time. The first search begins at a pose that sparse image alignment has
     refined, and this alignment may have followed moving objects. The second search begins at the
     predicted pose. The result with more inliers is used. [own]"""
-    patch_feature_reach: float = Field(2.0, gt=0)
-    """If too few descriptors of a new keyframe match, each landmark whose patch was found is
-    matched to the nearest feature. The distance is at most this value, in pixels of the feature's
-    octave. [own]"""
-    match_distance: int = Field(100, ge=0, le=256)
-    """Upper bound of the descriptor distance when landmarks are matched near their projections, in
-    bits. [OS1 V-D, customary]"""
-    match_ratio: float = Field(0.8, gt=0, le=1)
-    """Upper bound of the ratio of the best to the second-best distance when the local map is
-    matched. [OS1 V-D, customary]"""
-    reference_distance: int = Field(50, ge=0, le=256)
-    """Upper bound of the descriptor distance when a frame is matched with the reference keyframe,
-    in bits. [OS1 V-B, customary]"""
-    reference_ratio: float = Field(0.7, gt=0, le=1)
-    """Upper bound of the ratio of the best to the second-best distance when a frame is matched with
-    the reference keyframe. [OS1 V-B, customary]"""
     motion_window: float = Field(7.0, gt=0)
     """Search radius when the points of the previous frame are matched, in pixels at octave 0.
     [OS1 V-B, customary]"""
     local_window: float = Field(2.5, gt=0)
     """Search radius when the local map is matched, in pixels at octave 0. [OS1 V-D, customary]"""
-    depth_motion_window: float = Field(15.0, gt=0)
-    """Replaces `motion_window` for an RGB-D camera, in pixels at octave 0. [OS1 V-B, customary]"""
-    depth_local_window: float = Field(5.0, gt=0)
-    """Replaces `local_window` for an RGB-D camera, in pixels at octave 0. ORB-SLAM2 uses 7.5.
-    [OS1 V-D, own]"""
-    predicted_window: float = Field(7.0, gt=0)
-    """Replaces `local_window` for a frame that could be matched with neither the previous frame nor
-    the reference keyframe, in pixels at octave 0. [own]"""
-    sudden_window: float = Field(100.0, gt=0)
-    """Search radius if the motion has changed so suddenly that a frame would be LOST, in pixels at
-    octave 0. The pose is then found by RANSAC among the matches with the previous frame. [own]"""
     sudden_min_inlier_ratio: float = Field(0.4, ge=0, le=1)
     """At least this fraction of the matches in `sudden_window` must be inliers, so that the camera
     is not tracked against a moving object. [own]"""
@@ -248,25 +154,12 @@ class TrackingConfig(Section):
     landmarks with the reference keyframe are chosen. [OS1 V-D, customary]"""
     min_stereo_start: int = Field(100, ge=10)
     """Number of stereo features that a frame needs to start a map. [OS2 III-B, own]"""
-    min_inliers_motion: int = Field(20, ge=3)
-    """A frame is tracked from the reference keyframe if tracking from the previous frame has fewer
-    inliers than this. [OS1 V-B, customary]"""
     min_inlier_ratio: float = Field(0.3, ge=0, le=1)
     """A frame is also tracked from the reference keyframe if less than this fraction of the matches
     with the previous frame are inliers. [own]"""
-    min_inliers_frame: int = Field(10, ge=3)
-    """A frame is matched with the local map only if tracking from the previous frame, from the
-    reference keyframe, with `predicted_window` or with `sudden_window` gives at least this many
-    inliers. Otherwise, the frame is LOST. [OS1 V-B, customary]"""
     min_inliers: int = Field(30, ge=3)
     """A frame with fewer inliers than this in the local map is WEAK. Its pose is used, but it is
     reported as uncertain. [OS1 V-D, customary]"""
-    min_inliers_lost: int = Field(15, ge=3)
-    """A frame with fewer inliers than this in the local map is LOST. Its pose is only predicted.
-    [own]"""
-    depth_min_inlier_ratio: float = Field(0.2, ge=0, le=1)
-    """A frame of an RGB-D camera is also LOST if less than this fraction of its matches are
-    inliers. [own]"""
     lost_frames_before_restart: int = Field(3, ge=1)
     """A stereo or RGB-D camera starts a sub-map at the predicted pose after this many lost frames.
     [own]"""
@@ -282,45 +175,17 @@ class InitializationConfig(Section):
 
     min_features: int = Field(200, ge=20)
     """A frame can become the first view if it has at least this many features. [own]"""
-    window: float = Field(100.0, gt=0)
-    """Search radius for matches in the second view, in pixels. A larger radius allows faster motion
-    between the views. [OS1 IV, customary]"""
-    match_distance: int = Field(50, ge=0, le=256)
-    """Upper bound of the descriptor distance of a match, in bits. [OS1 IV, customary]"""
-    match_ratio: float = Field(0.9, gt=0, le=1)
-    """Upper bound of the ratio of the best to the second-best distance. [OS1 IV, customary]"""
     min_matches: int = Field(100, ge=8)
     """If the two views have fewer matches than this, the second view replaces the first.
-    [OS1 IV, customary]"""
-    draws: int = Field(300, ge=1)
-    """Number of RANSAC draws for each of the two models. ORB-SLAM uses 200. [OS1 IV, own]"""
-    homography_share: float = Field(0.45, gt=0, lt=1)
-    """The homography is chosen if its fraction of the sum of both scores is above this value.
-    Otherwise, the fundamental matrix is chosen. [OS1 IV, printed]"""
-    max_error: float = Field(2.0, gt=0)
-    """Upper bound of the reprojection error of an inlier, in pixels at octave 0.
     [OS1 IV, customary]"""
     min_parallax_deg: float = Field(1.0, gt=0)
     """At least `min_points` points must have this parallax, in degrees. With a larger value, the
     map starts only after a longer motion of the camera. [OS1 IV, customary]"""
-    min_points: int = Field(50, ge=8)
-    """At least this many points must be triangulated with a parallax of `min_parallax_deg`. [OS1
-    IV, customary]"""
-    min_point_share: float = Field(0.7, gt=0, le=1)
-    """At least this fraction of the inliers of the model must be triangulated in front of both
-    cameras. [OS1 IV, own]"""
-    max_rival_share: float = Field(0.7, gt=0, le=1)
-    """The motion is ambiguous if the second-best motion explains more than this fraction of the
-    points that the best motion explains. An ambiguous motion is rejected. [OS1 IV, customary]"""
     min_landmarks: int = Field(100, ge=8)
     """At least this many landmarks must remain after the first bundle adjustment.
     [OS1 IV, customary]"""
     median_depth: float = Field(15.0, gt=0)
     """The first landmarks are scaled to this median depth, in map units. [own]"""
-    max_rescaling: float = Field(10.0, gt=1)
-    """A sub-map is rescaled so that the camera keeps the speed that it had before it was lost. It
-    is not rescaled if the factor would be larger than this number or smaller than its inverse.
-    [own]"""
     max_seconds: float = Field(1.5, gt=0)
     """Longest time between the two views, in seconds. After this time, the next frame replaces the
     first view. [own]"""
@@ -341,34 +206,14 @@ class KeyframeConfig(Section):
     min_new_close: int = Field(70, ge=0)
     """If a frame tracks too few close points, it becomes a keyframe only if it could add more new
     close points than this. [OS2 III-E, printed]"""
-    min_kept_close: float = Field(0.2, ge=0, le=1)
-    """If keyframes add on average fewer close points than `min_tracked_close`, this fraction of the
-    average replaces `min_tracked_close` (docs/research/motorway.md). [own]"""
-    first_gain: float = Field(2.0, ge=0)
-    """Before the first observation, the number of close points that a keyframe adds is assumed to
-    be this multiple of `min_tracked_close`. [own]"""
-    gain_weight: float = Field(0.2, gt=0, le=1)
-    """Weight of the latest keyframe in the running mean of the number of close points that a
-    keyframe adds. A larger weight adapts faster to the scene. [own]"""
     patch_kept_close: float = Field(0.4, ge=0, le=1)
     """A frame that was tracked by patches becomes a keyframe if it tracks less than this fraction
     of the close points that the first frame after the last keyframe tracked. [own]"""
-    patch_lead_frames: int = Field(2, ge=0)
-    """When frames are tracked by patches, a keyframe is planned up to this many frames ahead, so
-    that its features can be extracted in advance. [own]"""
     max_tracked_ratio: float = Field(0.75, gt=0, le=1)
     """A keyframe is inserted if the frame tracks less than this fraction of the landmarks of the
     reference keyframe. A larger fraction inserts keyframes more often. [OS1 V-E, customary]"""
-    urgent_ratio: float = Field(0.25, gt=0, le=1)
-    """A keyframe is inserted, even while local mapping is busy, if the frame tracks less than this
-    fraction of the landmarks of the reference keyframe. [OS1 V-E, customary]"""
     monocular_ratio: float = Field(0.9, gt=0, le=1)
     """Replaces `max_tracked_ratio` for a monocular camera. [OS1 V-E, printed]"""
-    monocular_min_tracked: int = Field(100, ge=0)
-    """With a monocular camera, a keyframe is also inserted while local mapping is busy if fewer
-    landmarks than this are tracked. [own]"""
-    monocular_urgent_ratio: float = Field(0.5, gt=0, le=1)
-    """Replaces `urgent_ratio` for a monocular camera. [own]"""
     known_after_s: float = Field(30.0, gt=0)
     """A keyframe is old after this time, in seconds. If the camera returns to a known place, an old
     keyframe becomes the reference again, and no new keyframe is inserted. [own]"""
@@ -389,39 +234,19 @@ class MappingConfig(Section):
     neighbours: int = Field(10, ge=1)
     """New landmarks are triangulated between a new keyframe and this many covisible keyframes.
     [OS1 VI-C, customary]"""
-    fuse_neighbours: int = Field(10, ge=1)
-    """Duplicate landmarks of a new keyframe and of this many covisible keyframes are fused.
-    [OS1 VI-C, customary]"""
-    monocular_neighbours: int = Field(20, ge=1)
-    """Replaces `neighbours` for a monocular camera. [OS1 VI-C, customary]"""
-    min_baseline_ratio: float = Field(0.01, ge=0)
-    """With a monocular camera, landmarks are triangulated between two keyframes only if the
-    distance between the keyframes is at least this fraction of the median depth. [OS1 VI-C,
-    customary]"""
-    min_parallax_cosine: float = Field(0.9998, gt=0, le=1)
-    """Upper bound of the cosine of the parallax of a triangulated point. The default corresponds to
-    1.1 degrees. A larger value also accepts points with less parallax. [OS1 VI-C, customary]"""
     epipolar_distance: int = Field(50, ge=0, le=256)
     """Upper bound of the descriptor distance when features are matched for triangulation, in bits.
     [OS1 VI-C, customary]"""
     fuse_distance: int = Field(50, ge=0, le=256)
     """Upper bound of the descriptor distance between duplicate landmarks, in bits.
     [OS1 VI-C, customary]"""
-    fuse_window: float = Field(3.0, gt=0)
-    """Search radius for duplicate landmarks, in pixels at octave 0. [OS1 VI-C, customary]"""
     min_stereo_points: int = Field(100, ge=0)
     """If a keyframe has fewer close stereo features than this, its nearest stereo features are
     mapped, up to this number. [OS2 III-E, printed]"""
-    min_found_ratio: float = Field(0.25, ge=0, le=1)
-    """A recent landmark is culled if it is found in less than this fraction of the frames in which
-    it should be visible. [OS1 VI-B, printed]"""
     redundant_ratio: float = Field(0.9, gt=0, le=1)
     """A keyframe is culled if more than this fraction of its landmarks are redundant. A landmark is
     redundant if at least three other keyframes observe it. With a larger fraction, more keyframes
     are kept. [OS1 VI-E, printed]"""
-    min_shared: int = Field(15, ge=1)
-    """Two keyframes are joined by a covisibility edge if they share at least this many landmarks.
-    [OS1 III-D, printed]"""
     max_ba_keyframes: int = Field(60, ge=2)
     """Upper bound of the number of keyframes that local bundle adjustment optimises.
     [OS1 VI-D, own]"""
@@ -438,28 +263,6 @@ class VerificationConfig(Section):
     `learned` uses the local descriptors of the network. `both` uses the learned descriptors where
     ORB fails. `auto` selects `orb` for the detectors `bow` and `capsule-paper` and for plug-ins,
     and `both` for all other detectors. [own]"""
-    match_distance: int = Field(50, ge=0, le=256)
-    """Upper bound of the descriptor distance of a match, in bits. [OS1 VII-B, customary]"""
-    match_ratio: float = Field(0.8, gt=0, le=1)
-    """Upper bound of the ratio of the best to the second-best distance. [OS1 VII-B, own]"""
-    min_matches: int = Field(20, ge=3)
-    """At least this many landmarks must be matched by descriptor. [OS1 VII-B, customary]"""
-    max_draws: int = Field(600, ge=1)
-    """Upper bound of the number of RANSAC draws. [OS1 VII-B, own]"""
-    confidence: float = Field(0.99, gt=0, lt=1)
-    """The probability with which RANSAC must draw at least one sample without outliers. [OS1 VII-B,
-    own]"""
-    min_consensus: int = Field(15, ge=6)
-    """RANSAC must find at least this many inliers. [OS1 VII-B, own]"""
-    place_keyframes: int = Field(10, ge=0)
-    """The landmarks of the matched keyframe and of this many covisible keyframes form the place
-    that guided search looks for. [own]"""
-    first_window: float = Field(8.0, gt=0)
-    """Search radius of the first guided search, in pixels at octave 0. [OS1 VII-B, own]"""
-    second_window: float = Field(4.0, gt=0)
-    """Search radius of the second guided search, in pixels at octave 0. [OS1 VII-B, own]"""
-    guided_distance: int = Field(64, ge=0, le=256)
-    """Upper bound of the descriptor distance in guided search, in bits. [OS1 VII-B, own]"""
     min_inliers: int = Field(40, ge=6)
     """At least this many inliers must remain after guided search. [OS1 VII-B, customary]"""
     max_distance: float = Field(15.0, gt=0)
@@ -475,8 +278,6 @@ class LearnedMatchingConfig(Section):
     max_compared: int = Field(5, ge=0)
     """If the detector has not compared its candidates using local descriptors, this many of the
     best candidates are compared before verification. [own]"""
-    views: int = Field(2, ge=1)
-    """Upper bound of the number of keyframes that are matched at each place. [own]"""
     most_shared: float = Field(0.4, gt=0, le=1)
     """The image of a keyframe is not kept for the network if the keyframe shares at least this
     fraction of its landmarks with another keyframe whose image is kept. [own]"""
@@ -488,36 +289,8 @@ class LearnedMatchingConfig(Section):
     retry_factor: float = Field(1.1, ge=1)
     """During the `retry_interval` keyframes after a failed attempt, a place is tried only if its
     similarity is at least this many times the similarity in the failed attempt. [own]"""
-    min_share: float = Field(0.1, ge=0, le=1)
-    """At least this fraction of the cells of the network's coarse feature map must agree with one
-    homography. [own]"""
-    min_coarse_similarity: float = Field(0.3, ge=-1, le=1)
-    """Two coarse descriptors match only if their cosine is at least this value. [own]"""
-    min_fine_similarity: float = Field(0.5, ge=-1, le=1)
-    """Two fine descriptors match only if their cosine is at least this value. [own]"""
-    reach: int = Field(5, ge=1)
-    """The fine match is searched for up to this distance to each side of the coarse match, in cells
-    of the network's fine feature map. [own]"""
-    guided_reach: int = Field(3, ge=1)
-    """A landmark is searched for up to this distance to each side of its projection, in cells of
-    the network's fine feature map. [own]"""
-    sigma: float = Field(1.5, gt=0)
-    """Standard deviation of the position of a match, in pixels of the network's input image. With a
-    larger value, matches with larger errors count as inliers. [own]"""
-    max_draws: int = Field(1000, ge=1)
-    """Upper bound of the number of RANSAC draws. [own]"""
-    confidence: float = Field(0.99, gt=0, lt=1)
-    """The probability with which RANSAC must draw at least one sample without outliers. [own]"""
-    min_consensus: int = Field(40, ge=4)
-    """RANSAC must find at least this many inliers. [own]"""
-    min_consensus_ratio: float = Field(0.15, ge=0, le=1)
-    """At least this fraction of the landmarks that are searched for must be inliers of RANSAC.
-    [own]"""
     min_inliers: int = Field(80, ge=6)
     """At least this many inliers must remain after guided search. [own]"""
-    fuse_pixels: float = Field(2.0, gt=0)
-    """A keypoint can observe a matched landmark only if it lies within this distance of the
-    landmark's projection, in pixels at octave 0. [own]"""
     verified_memory: int = Field(10, ge=1)
     """With learned verification, `consistency.verified_memory` is raised to this number if it is
     smaller, because only some keyframes have an image with which a loop can be verified. [own]"""
@@ -532,9 +305,6 @@ class ConsistencyConfig(Section):
     max_gap: int = Field(1, ge=0)
     """Between two keyframes that resemble the place, up to this many keyframes need not resemble
     it. OS1 allows none. [OS1 VII-A, own]"""
-    min_shared: int = Field(30, ge=1)
-    """Keyframes that share at least this many landmarks with a candidate belong to the same place.
-    [own]"""
     max_wrong: float = Field(3e-3, gt=0, le=0.5)
     """A loop is closed only if the probability that it is wrong is at most this value, according to
     its own evidence and that of a loop that agrees with it. [own]"""
@@ -543,12 +313,6 @@ class ConsistencyConfig(Section):
     probability is at most this value. [own]"""
     verified_memory: int = Field(5, ge=1)
     """A verified loop is remembered for this many keyframes. [own]"""
-    max_apart: float = Field(0.5, gt=0)
-    """Each verified loop implies a pose of the query. Two loops agree if these positions are at
-    most this far apart, in metres. [own]"""
-    max_turn: float = Field(1.0, gt=0)
-    """Two loops agree only if the orientations of the query that they imply differ by at most this
-    value, in degrees. [own]"""
     min_moved: float = Field(0.15, ge=0)
     """At the end of a drive, an earlier keyframe may confirm a loop only if its distance from the
     query is at least this fraction of the median depth of the matched landmarks. A nearer keyframe
@@ -558,21 +322,6 @@ class ConsistencyConfig(Section):
 class RelocalizationConfig(Section):
     """Relocalisation of a lost camera [OS1, V-C]."""
 
-    match_distance: int = Field(50, ge=0, le=256)
-    """Upper bound of the descriptor distance of a match, in bits. [OS1 V-C, customary]"""
-    match_ratio: float = Field(0.75, gt=0, le=1)
-    """Upper bound of the ratio of the best to the second-best distance. [OS1 V-C, customary]"""
-    min_matches: int = Field(15, ge=4)
-    """At least this many landmarks must be matched by descriptor. [OS1 V-C, customary]"""
-    max_draws: int = Field(600, ge=1)
-    """Upper bound of the number of RANSAC draws. [OS1 V-C, own]"""
-    confidence: float = Field(0.99, gt=0, lt=1)
-    """The probability with which RANSAC must draw at least one sample without outliers. [OS1 V-C,
-    customary]"""
-    min_consensus: int = Field(10, ge=4)
-    """RANSAC must find at least this many inliers. [OS1 V-C, customary]"""
-    first_window: float = Field(8.0, gt=0)
-    """Search radius of the first guided search, in pixels at octave 0. [OS1 V-C, own]"""
     min_inliers: int = Field(50, ge=6)
     """A frame is relocalised if it has at least this many inliers. [OS1 V-C, customary]"""
     min_elsewhere: int = Field(15, ge=0)
@@ -592,8 +341,6 @@ class RelocalizationConfig(Section):
     better: float = Field(1.5, ge=1)
     """For a doubtful frame, the pose that the search of the whole map finds is used only if it has
     more than this many times as many inliers as the tracked pose. [own]"""
-    neighbours: int = Field(20, ge=1)
-    """The landmarks of this many keyframes around a candidate place are matched. [own]"""
 
 
 class LoopConfig(Section):
@@ -606,10 +353,6 @@ class LoopConfig(Section):
     global_iterations: int = Field(10, ge=1)
     """Upper bound of the number of iterations of global bundle adjustment.
     [OS2 III-D, customary]"""
-    observations_per_keyframe: int = Field(25000, ge=1)
-    """The result of global bundle adjustment is applied `1 + n // observations_per_keyframe`
-    keyframes after its loop, where n is the number of observations. With a smaller value, mapping
-    waits for the result less often. [own]"""
     min_revisits: int = Field(5, ge=1)
     """The map is adjusted again when the camera leaves old places and at the end of the drive, if
     at least this many frames have measured old places since the last adjustment. These frames are
@@ -622,21 +365,11 @@ class LoopConfig(Section):
 class BowConfig(Section):
     """Loop candidates from a bag of words [OS1, III-E and VII-A]."""
 
-    min_shared: int = Field(15, ge=1)
-    """Two keyframes are neighbours if they share at least this many landmarks. The neighbours of
-    the query are never candidates. A candidate must have at least the lowest score of these
-    neighbours. [OS1 III-D, printed]"""
     exclude_recent: int = Field(20, ge=1)
     """This many of the newest keyframes, including the query, are never candidates. [own]"""
-    common_words_ratio: float = Field(0.8, ge=0, le=1)
-    """The number of words that a candidate shares with the query must be at least this fraction of
-    the largest number that any keyframe shares with the query. [OS1 III-E, customary]"""
     group_size: int = Field(10, ge=0)
     """A candidate forms a group with at most this many of its most covisible keyframes.
     [OS1 III-E, customary]"""
-    group_score_ratio: float = Field(0.75, ge=0, le=1)
-    """A group is kept if its score is at least this fraction of the score of the best group. [OS1
-    III-E, printed]"""
     max_groups: int = Field(30, ge=1)
     """Upper bound of the number of groups. Groups are formed around the candidates with the highest
     scores. [own]"""
@@ -657,54 +390,18 @@ class PoseGraphConfig(Section):
     min_shared: int = Field(100, ge=1)
     """A covisibility edge belongs to the graph if its two keyframes share at least this many
     landmarks. [OS1 III-D, printed]"""
-    min_shared_tree: int = Field(15, ge=1)
-    """An edge of the spanning tree across a restart of mapping is weak if its two keyframes share
-    fewer landmarks than this. [OS1 III-D, printed]"""
     translation_drift: float = Field(0.03, gt=0)
     """Standard deviation of the translational drift of odometry, in metres per square root of a
     metre. [own]"""
     rotation_drift: float = Field(0.001, gt=0)
     """Standard deviation of the rotational drift of odometry, in radians per square root of a
     metre. [own]"""
-    scale_drift: float = Field(0.01, gt=0)
-    """Standard deviation of the scale drift of monocular odometry, as the logarithm of the scale
-    per square root of a map unit. [own]"""
-    min_length: float = Field(0.3, gt=0)
-    """An edge shorter than this counts as this long in the drift model, in metres. [own]"""
     loop_inflation: float = Field(1.5, gt=0)
     """Factor that multiplies the computed covariance of a verified loop, which does not contain the
     errors of the landmarks (docs/research/uncertainty.md). [own]"""
-    loop_translation: float = Field(0.1, gt=0)
-    """Standard deviation of the translation of a loop whose covariance is unknown, in metres.
-    [own]"""
-    loop_rotation: float = Field(0.005, gt=0)
-    """Standard deviation of the rotation of a loop whose covariance is unknown, in radians.
-    [own]"""
-    loop_scale: float = Field(0.02, gt=0)
-    """Standard deviation of the logarithm of the scale of a verified loop. [own]"""
-    weak_scale: float = Field(3.0, gt=0)
-    """Standard deviation of the logarithm of the scale of a weak edge. [own]"""
-    weak_translation: float = Field(100.0, gt=0)
-    """Standard deviation of the translation of a weak edge, in metres. [own]"""
-    weak_rotation: float = Field(1.0, gt=0)
-    """Standard deviation of the rotation of a weak edge, in radians. [own]"""
-    gap_translation: float = Field(0.5, gt=0)
-    """Standard deviation of the translation of a gap, as a fraction of the predicted distance.
-    [own]"""
-    gap_speed: float = Field(2.0, gt=0)
-    """Lower bound of the standard deviation of the translation of a gap, in metres per second of
-    its duration. [own]"""
-    gap_rotation: float = Field(0.3, gt=0)
-    """Standard deviation of the rotation of a gap, in radians per second of its duration. [own]"""
-    gap_scale: float = Field(0.3, gt=0)
-    """Standard deviation of the logarithm of the scale of a gap. [own]"""
-    min_gap: float = Field(0.3, gt=0)
-    """A gap shorter than this counts as this long, in seconds. [own]"""
     robust_scale: float = Field(3.0, gt=0)
     """Scale of the Cauchy loss on loops, in standard deviations. A smaller scale reduces the
     influence of loops that contradict the other edges. [own]"""
-    iterations: int = Field(50, ge=1)
-    """Upper bound of the number of Levenberg-Marquardt iterations. [own]"""
     max_loop_error: float = Field(30.0, gt=0)
     """A loop is rejected if its chi-square after optimisation is above this value. [own]"""
     max_strain: float = Field(60.0, gt=0)
@@ -720,15 +417,10 @@ class SiameseConfig(Section):
     offered: float = Field(0.1, ge=0, le=1)
     """Replaces `threshold` if learned descriptors verify the candidates. A smaller value proposes
     more candidates. [own]"""
-    reranked: int = Field(20, ge=1)
-    """This many of the most similar keyframes are ranked again using local descriptors. [own]"""
     max_candidates: int = Field(5, ge=1)
     """Upper bound of the number of candidates for a query. The best candidates are kept. [own]"""
     recent_keyframes: int = Field(10, ge=0)
     """This many of the newest keyframes are never candidates. [own]"""
-    min_shared: int = Field(15, ge=1)
-    """Two keyframes show the same place if they share at least this many landmarks. Only the best
-    candidate of each place is proposed. [OS1 III-D, printed]"""
     reach: float = Field(20.0, ge=0)
     """If learned descriptors verify the candidates, the query is compared only with keyframes
     within this distance, in metres. `reach_share` increases this distance. [own]"""
@@ -786,7 +478,7 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _nest(cls, given: Any) -> Any:
-        """Move thresholds with dotted names into their sections, and update old names."""
+        """Move thresholds with dotted names into their sections."""
         if not isinstance(given, dict):
             return given
         nested = {name: value for name, value in given.items() if "." not in str(name)}
@@ -797,12 +489,6 @@ class Config(Section):
                 nested[section] = {**values, key: given[name]}
             else:
                 nested[name] = given[name]  # validation reports it as an unknown key
-        for section, names in _RENAMED.items():
-            if isinstance(values := nested.get(section), dict):
-                nested[section] = {names.get(key, key): value for key, value in values.items()}
-        verification = nested.get("verification")
-        if isinstance(verification, dict) and verification.get("descriptors") == "usual":
-            nested["verification"] = {**verification, "descriptors": "auto"}
         return nested
 
 

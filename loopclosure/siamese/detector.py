@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vslam.config import LearnedMatchingConfig, SiameseConfig
 from vslam.loopclosure.bow_index import grown
 from vslam.loopclosure.detector import require_same
-from vslam.loopclosure.local_matching import DescriptorMaps, likeness
+from vslam.loopclosure.local_matching import MIN_COARSE_SIMILARITY, DescriptorMaps, likeness
 from vslam.loopclosure.reach import beyond_reach
 from vslam.loopclosure.siamese.images import to_size
 from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
@@ -19,6 +19,12 @@ from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.types.features import Features
 from vslam.types.loops import DetectorMemory, LoopCandidate, PerKeyframe
 from vslam.types.map import Map
+
+# This many of the most similar keyframes are ranked again using local descriptors. [own]
+_RERANKED = 20
+# Two keyframes show the same place if they share at least this many landmarks. Only the best
+# candidate of each place is proposed. [OS1 III-D, printed]
+_MIN_SHARED = 15
 
 
 class SiameseDetector:
@@ -190,10 +196,10 @@ class SiameseDetector:
         """
         assert self._images is not None
         rating = np.full(len(p), -1.0, np.float32)
-        for keyframe in np.argsort(-p, kind="stable")[: self._config.reranked].tolist():
+        for keyframe in np.argsort(-p, kind="stable")[:_RERANKED].tolist():
             if p[keyframe] >= 0 and keyframe in self._images:
                 glance = self._images.glance(keyframe)
-                rating[keyframe] = likeness(query, glance, self._learned.min_coarse_similarity)
+                rating[keyframe] = likeness(query, glance, MIN_COARSE_SIMILARITY)
         return rating
 
     def _best(
@@ -220,7 +226,7 @@ class SiameseDetector:
                 break
             similarity = None if self._images is None else float(rating[best])
             found.append(LoopCandidate(query, best, float(p[best]), similarity, self.name))
-            around, _ = map_.covisible(best, self._config.min_shared)
+            around, _ = map_.covisible(best, _MIN_SHARED)
             rating[around[around < len(rating)]] = -1.0
             rating[best] = -1.0
         return found

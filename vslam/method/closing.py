@@ -40,6 +40,11 @@ from vslam.types.map import Map
 from vslam.types.map_kernels import cut_path
 from vslam.types.states import ClosingState
 
+# The result of global bundle adjustment is applied `1 + n // observations_per_keyframe` keyframes
+# after its loop, where n is the number of observations. With a smaller value, mapping waits for
+# the result less often. [own]
+_OBSERVATIONS_PER_KEYFRAME = 25000
+
 _log = logging.getLogger(__name__)
 
 
@@ -261,8 +266,8 @@ class LoopClosing:
         keyframes = solution.graph.keyframes
         before = map_.arrays.T_cw[keyframes]
         # Collected before fusion, which makes both sides of the loop covisible.
-        query_side = [edge.query, *strong_neighbours(map_, edge.query, self._config)]
-        match_side = [edge.match, *strong_neighbours(map_, edge.match, self._config)]
+        query_side = [edge.query, *strong_neighbours(map_, edge.query)]
+        match_side = [edge.match, *strong_neighbours(map_, edge.match)]
         self.closed.append(edge)
         for keyframe in solution.mistracked:  # its observations are as wrong as its pose
             cut_path(map_.arrays, keyframe, map_.n_keyframes)
@@ -296,7 +301,7 @@ class LoopClosing:
     def _start_global(self, map_: Map, keyframe: int) -> _PendingAdjustment:
         config = self._config.loops
         snapshot, self._new_revisits = take_snapshot(map_, self._camera), 0
-        wait = 1 + len(snapshot.problem.camera) // config.observations_per_keyframe
+        wait = 1 + len(snapshot.problem.camera) // _OBSERVATIONS_PER_KEYFRAME
         stop = threading.Event()
 
         def work() -> BundleSolution:

@@ -13,6 +13,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from vslam.backend.similarity_graph import GAP_SCALE
 from vslam.method.hypotheses import joined_submaps
 from vslam.types.context import Context
 from vslam.types.frame_poses import FramePoses
@@ -77,7 +78,7 @@ def find_gaps(
     Args:
         frames: poses of the frames of the drive.
     """
-    scale = math.exp(context.config.pose_graph.gap_scale) if context.camera.monocular else 1.0
+    scale = math.exp(GAP_SCALE) if context.camera.monocular else 1.0
     table = frames.table()
     tracked, times = np.flatnonzero(table.tracked), table.timestamp
     if not len(tracked) or not map_.n_keyframes:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vslam.config import Config
+from vslam.loopclosure.consistency import MIN_SHARED
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verifier import Verifier
@@ -116,7 +117,7 @@ def join(
     closing.closed.extend(both.loops)
     map_, n = both.map, one.map.n_keyframes
     for keyframe in range(n, map_.n_keyframes):
-        candidates = _candidates(map_, keyframe, detector, images, config)
+        candidates = _candidates(map_, keyframe, detector, images)
         closing.consider(map_, keyframe, candidates)
         on_keyframe()
     if not closing.corrections:
@@ -131,7 +132,6 @@ def _candidates(
     keyframe: int,
     detector: LoopDetector,
     images: KeyframeImages | None,
-    config: Config,
 ) -> list[LoopCandidate]:
     """Find keyframes of the first map that may show the same place as a keyframe of the second map.
 
@@ -139,7 +139,7 @@ def _candidates(
     """
     image = images.image(keyframe) if images is not None and keyframe in images else None
     found = detector.locate(image, features_of(map_, keyframe), map_)
-    joined = set(map_.covisible(keyframe, config.consistency.min_shared)[0].tolist())
+    joined = set(map_.covisible(keyframe, MIN_SHARED)[0].tolist())
     return [replace(one, query=keyframe) for one in found if one.match not in joined]
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 
 from vslam.backend.disparity_offset import map_and_calibrate
-from vslam.backend.local_mapping import refresh_keyframe
+from vslam.backend.local_mapping import MIN_SHARED, refresh_keyframe
 from vslam.backend.triangulation import map_stereo_points
 from vslam.frontend.patches import certainty_of
 from vslam.frontend.track import Track
@@ -76,7 +76,7 @@ class Mapper:
             keyframe = add_frame(map_, track, certainty, published.reference, predicted=predicted)
             map_stereo_points(map_, keyframe, self._context.camera, config)
             refresh_keyframe(map_, keyframe)
-            if sees_old_place(map_, keyframe, config.mapping.min_shared):
+            if sees_old_place(map_, keyframe, MIN_SHARED):
                 closing.count_revisit(map_)
             else:
                 closing.adjust_after_revisits(map_)

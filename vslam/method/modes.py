@@ -18,6 +18,10 @@ from vslam.types.context import Context
 from vslam.types.geometry import inverse, orthonormalised, se3_log
 from vslam.types.states import PolicyState
 
+# A sub-map is rescaled so that the camera keeps the speed that it had before it was lost. It is
+# not rescaled if the factor would be larger than this number or smaller than its inverse. [own]
+_MAX_RESCALING = 10.0
+
 # A standing camera is still at its reference keyframe if it has moved by less than this many
 # baselines, and if its rotation moves the image by less than this many pixels.
 STANDS_M, STANDS_PX = 0.1, 3.0
@@ -139,7 +143,7 @@ class Building:
         if start is None:
             return track
         (moved,) = self._published.complete(track)
-        start = start.at_speed(moved.twist, self._config.initialization.max_rescaling)
+        start = start.at_speed(moved.twist, _MAX_RESCALING)
         track = self._mapper.begin(start)
         self.starter.reset()
         return track

@@ -72,7 +72,7 @@ def match_images(left: Image, right: Image) -> Matches:
     """
     images = describe(left), describe(right)
     if is_faint((left, right), (len(images[0].xy), len(images[1].xy)), _CONFIG):
-        clear = [with_contrast(image, _CONFIG.weak_images) for image in (left, right)]
+        clear = [with_contrast(image) for image in (left, right)]
         images = describe(clear[0]), describe(clear[1])
     return match_described(*images)
 

@@ -34,6 +34,14 @@ from vslam.run.matching import describe, match_described
 from vslam.support.errors import UnreadableImageError
 from vslam.types.camera import Camera, Image
 
+# The report warns if the measured delay of the right camera differs too much from the delay in
+# the calibration. The difference must exceed this value, in seconds, and also `delay_sigmas`
+# (docs/research/stress.md). [own]
+_LEAST_DELAY = 1.2e-3
+# The report warns of a delay only if the difference also exceeds this many standard deviations of
+# the measured delay. [own]
+_DELAY_SIGMAS = 5.0
+
 _FEATURES = 1000
 _FEWEST, _MOST = 10, 32  # measured frames
 _APART = 5  # frames; measured frames are at least as far apart
@@ -63,7 +71,7 @@ class SideDelay:
     def is_wrong(self, camera: Camera, config: StereoConfig) -> bool:
         """Return whether the delay differs significantly from that in the calibration
         (``Camera.right_delay``)."""
-        least = max(config.least_delay, config.delay_sigmas * self.sigma)
+        least = max(_LEAST_DELAY, _DELAY_SIGMAS * self.sigma)
         return abs(self.seconds - camera.right_delay) > least
 
     def description(self) -> str:

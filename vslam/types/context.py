@@ -10,6 +10,12 @@ from numpy.typing import NDArray
 from vslam.config import Config, OrbConfig
 from vslam.types.camera import Camera
 
+# Replaces `motion_window` for an RGB-D camera, in pixels at octave 0. [OS1 V-B, customary]
+_DEPTH_MOTION_WINDOW = 15.0
+# Replaces `local_window` for an RGB-D camera, in pixels at octave 0. ORB-SLAM2 uses 7.5. [OS1
+# V-D, own]
+_DEPTH_LOCAL_WINDOW = 5.0
+
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
     """Return the ``(levels,)`` sizes of a pixel of each level, in pixels of the image."""
@@ -53,10 +59,10 @@ class Context:
     def motion_window(self) -> float:
         """Search radius at octave 0 around points that the previous frame observed, in pixels."""
         config = self.config.tracking
-        return config.depth_motion_window if self.camera.depth else config.motion_window
+        return _DEPTH_MOTION_WINDOW if self.camera.depth else config.motion_window
 
     @property
     def local_window(self) -> float:
         """Search radius at octave 0 around landmarks of the local map, in pixels."""
         config = self.config.tracking
-        return config.depth_local_window if self.camera.depth else config.local_window
+        return _DEPTH_LOCAL_WINDOW if self.camera.depth else config.local_window

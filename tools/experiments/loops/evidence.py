@@ -27,7 +27,7 @@ from vslam.datasets.perturbation import parse_perturbation, perturbed
 from vslam.loopclosure import verification
 from vslam.loopclosure.evidence import Weights
 from vslam.loopclosure.learned_verification import verify_learned
-from vslam.loopclosure.local_matching import likeness
+from vslam.loopclosure.local_matching import MIN_COARSE_SIMILARITY, likeness
 from vslam.loopclosure.registry import create_images
 from vslam.run.outcome import ground_truth_of
 from vslam.slam import Slam
@@ -97,7 +97,7 @@ def pairs_of(map_: Map, images, config: Config) -> list[LoopCandidate]:
     for query in [k for k in living if k in images]:
         glance = images.glance(query)
         others = [m for m in living if m in images and m < query - APART and m not in near[query]]
-        least = config.learned.min_coarse_similarity
+        least = MIN_COARSE_SIMILARITY
         similar = sorted((likeness(glance, images.glance(m), least), m) for m in others)
         for similarity, match in similar[-MOST_SIMILAR:]:
             if similarity >= config.learned.min_similarity:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import LearnedMatchingConfig, VerificationConfig
 from vslam.lab.loopbench.conditions import Condition
 from vslam.lab.loopbench.detectors import (
     DescribedImage,
@@ -17,6 +16,9 @@ from vslam.lab.loopbench.node_matching import match_by_node
 from vslam.lab.loopbench.schema import Curve, Gain, Score, Verified
 from vslam.lab.loopbench.sets import QuerySet, TestSet
 from vslam.loopclosure.local_matching import (
+    MIN_COARSE_SIMILARITY,
+    MIN_FINE_SIMILARITY,
+    REACH,
     fine_agreement,
     homography_inliers,
     locate,
@@ -32,6 +34,7 @@ from vslam.loopclosure.precision_recall import (
     top_k_precision_recall,
 )
 from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
+from vslam.loopclosure.verification import MATCH_DISTANCE, MATCH_RATIO
 from vslam.types.geometry import Matrix
 
 # Verification by learned descriptors: the least number of confirmed cells (`confirmed_cells`), and
@@ -244,16 +247,15 @@ def confirmed_cells(a: DescribedImage, b: DescribedImage, local: LocalDescriptor
 
     Fewer than ``MIN_CONFIRMED`` coarse matches are returned without a search for fine matches.
     """
-    config = LearnedMatchingConfig()
     coarse_a, coarse_b = local.of(a), local.of(b)
     counted = match_coarse(coarse_a, coarse_b, LEAST_COSINE)
     cells = homography_inliers(counted, coarse_a, coarse_b)
     if cells < MIN_CONFIRMED:
         return float(cells)
-    guides = match_coarse(coarse_a, coarse_b, config.min_coarse_similarity)
+    guides = match_coarse(coarse_a, coarse_b, MIN_COARSE_SIMILARITY)
     chosen = np.linspace(0, len(a.xy) - 1, min(_KEYPOINTS, len(a.xy))).astype(np.int64)
     xy, fine_a, fine_b = a.xy[chosen], local.with_fine(a), local.with_fine(b)
-    located = locate(xy, fine_a, fine_b, guides, config.reach, config.min_fine_similarity)
+    located = locate(xy, fine_a, fine_b, guides, REACH, MIN_FINE_SIMILARITY)
     return cells * fine_agreement(xy, located, fine_a, fine_b)
 
 
@@ -261,10 +263,9 @@ def epipolar_inliers(a: DescribedImage, b: DescribedImage) -> int:
     """Count the ORB matches between two images that are inliers of the best fundamental matrix."""
     import cv2
 
-    config = VerificationConfig()
     match = match_by_node(
         *a.nodes, a.descriptors.view(np.uint64), *b.nodes, b.descriptors.view(np.uint64),
-        config.match_distance, config.match_ratio,
+        MATCH_DISTANCE, MATCH_RATIO,
     )  # fmt: skip
     rows = np.flatnonzero(match >= 0)
     if len(rows) < MIN_MATCHES:

@@ -39,7 +39,7 @@ types: $(DEVELOPED)  ## check types
 	rm -rf build
 	$(BIN)/python -m pip install --quiet --no-deps --target build/typecheck .
 	cd build/typecheck && \
-	  $(BIN)/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache -p vslam
+	  $(BIN)/mypy --config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache -p vslam -p vslam_lab
 
 format: $(DEVELOPED)  ## format the code and repair what lint can
 	$(BIN)/ruff format
@@ -64,7 +64,7 @@ clean:  ## remove build products and caches (.venv, data and runs stay)
 $(INSTALLED): pyproject.toml constraints.txt
 	@set -e; \
 	if [ ! -x $(BIN)/python ]; then \
-	  for python in $(PYTHON) python3.11 python3 python3.13 python3.12; do \
+	  for python in $(PYTHON) python3.11 python3 python3.14 python3.13 python3.12; do \
 	    if $$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then break; fi; \
 	    python=; \
 	  done; \

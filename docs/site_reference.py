@@ -67,11 +67,11 @@ def commands_page() -> str:
     """Return the page with the arguments and options of every command."""
     import typer
 
-    from vslam.cli.main import app
+    from vslam.cli.main import every_command
 
     lines = ["# Commands", "", "This page is generated from the code of the command line."]
     lines += ["`vslam COMMAND --help` prints the same descriptions.", ""]
-    for name, command in _commands("vslam", typer.main.get_command(app)):
+    for name, command in _commands("vslam", typer.main.get_command(every_command())):
         lines += [f"## `{name}`", "", _plain(command.help or ""), ""]
         options = [_row(p) for p in command.params if p.name != "help"]
         if options:

@@ -13,14 +13,14 @@ import pytest
 
 from vslam.cli import main as cli
 from vslam.datasets.kitti import open_kitti
-from vslam.datasets.synthetic.routes import built_in_route
-from vslam.datasets.synthetic.site import Variation
-from vslam.datasets.synthetic.store import render_sequence
 from vslam.run.warmup import compile_kernels
 from vslam.types.camera import Camera
 from vslam.types.geometry import se3_exp
 from vslam.types.map import Map
 from vslam.types.trajectory import write_kitti
+from vslam_lab.towns.routes import built_in_route
+from vslam_lab.towns.site import Variation
+from vslam_lab.towns.store import render_sequence
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vslam.loopclosure.training.lite import LiteExtractor
-from vslam.loopclosure.training.preprocessing import standardised, textured
+from vslam_lab.training.lite import LiteExtractor
+from vslam_lab.training.preprocessing import standardised, textured
 
 COARSE_SIZE, FINE_SIZE = 64, 32  # dimensions of the descriptors
 _QUARTER = 3  # blocks of the extractor up to stride 4, with 24 channels

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from vslam.loopclosure.training.capsules import Over, squash
+from vslam_lab.training.capsules import Over, squash
 
 
 def predict(u: Tensor, W: Tensor) -> Tensor:

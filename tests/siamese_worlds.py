@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import torch
 
-from vslam.loopclosure.training.augmentation import Augmentation
-from vslam.loopclosure.training.branches import CapsuleShape
-from vslam.loopclosure.training.data import Collection
-from vslam.loopclosure.training.settings import TrainSettings
-from vslam.loopclosure.training.siamese import SiameseNetwork, build_network
+from vslam_lab.training.augmentation import Augmentation
+from vslam_lab.training.branches import CapsuleShape
+from vslam_lab.training.data import Collection
+from vslam_lab.training.settings import TrainSettings
+from vslam_lab.training.siamese import SiameseNetwork, build_network
 
 SMALL = CapsuleShape(pixels=64, blocks=((16, 2, 1), (24, 2, 1), (32, 2, 2)), types=8, outputs=8)
 MILD = Augmentation(

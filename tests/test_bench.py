@@ -19,11 +19,11 @@ from stub_runner import COMMAND, started, wait_for
 from typer.testing import CliRunner
 
 from vslam.cli import main as cli
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.config import Config
-from vslam.lab.bench import estimate, execute, grid, table
-from vslam.lab.bench.grid import Cell
 from vslam.support.errors import InputError, ResultsError
+from vslam_lab.bench import estimate, execute, grid, table
+from vslam_lab.bench.grid import Cell
 
 CONFIG = Config().model_dump_json(indent=2) + "\n"
 
@@ -376,7 +376,7 @@ def test_other_thresholds_are_other_rows_and_overwrite_nothing(bench, stub: Path
 
 
 def test_help_begins_with_the_table_of_the_mission():
-    text = CliRunner().invoke(app, ["bench", "--help"], env={"COLUMNS": "100"}).output
+    text = CliRunner().invoke(every_command(), ["bench", "--help"], env={"COLUMNS": "100"}).output
     examples = [
         line.split("(")[0].split()
         for line in text.splitlines()
@@ -483,7 +483,7 @@ def test_a_cell_runs_with_the_networks_that_are_shipped(kitti_tree: Path, tmp_pa
 
 
 def test_a_run_ends_by_itself_though_its_standard_input_is_open():
-    command = [sys.executable, "-m", "vslam.cli.child", "--version"]
+    command = [sys.executable, "-m", "vslam_lab.cli.child", "--version"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.wait(60) == 0
 
@@ -496,16 +496,16 @@ def test_a_video_is_a_grid_of_one_sequence(corridor, tmp_path: Path, monkeypatch
     words = ["bench", "--data", "drive.mkv", "--side-by-side", "--calib", "stereo.yaml"]
     words += ["--perturb", "none", "--detectors", "none", "--out", "grid"]
     monkeypatch.chdir(tmp_path)
-    first = CliRunner().invoke(app, words)
+    first = CliRunner().invoke(every_command(), words)
     assert first.exit_code == 0, first.output
     assert "1 of 1 run finished" in first.output
     (report,) = (tmp_path / "grid").glob("*/report.json")
     found = json.loads(report.read_text())
     assert (found["dataset"], found["sequence"], found["frames"]) == ("video", "drive", 5)
     assert found["calib"] == [str(calib)]
-    again = CliRunner().invoke(app, words)
+    again = CliRunner().invoke(every_command(), words)
     assert "1 run, 0 to do" in again.output
-    other = CliRunner().invoke(app, [*words, "--fps", "20"])
+    other = CliRunner().invoke(every_command(), [*words, "--fps", "20"])
     assert f"contains runs on {video} --side-by-side {calib}, not on {video}" in str(
         other.exception
     )
@@ -520,5 +520,5 @@ def test_a_video_is_a_grid_of_one_sequence(corridor, tmp_path: Path, monkeypatch
 )
 def test_sources_that_cannot_be_a_grid(tmp_path: Path, monkeypatch, words, part):
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(app, ["bench", *words.split()])
+    done = CliRunner().invoke(every_command(), ["bench", *words.split()])
     assert part in str(done.exception)

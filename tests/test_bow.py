@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from vslam.config import BowConfig
-from vslam.lab.loopbench.node_matching import index_nodes, match_by_node
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.bow_index import InvertedIndex
 from vslam.loopclosure.detector import LoopDetector
@@ -17,6 +16,7 @@ from vslam.loopclosure.vocabulary_training import train
 from vslam.types.features import Features
 from vslam.types.map import Map
 from vslam.types.map_kernels import link_many
+from vslam_lab.loopbench.node_matching import index_nodes, match_by_node
 
 WORDS = 400
 

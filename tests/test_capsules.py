@@ -9,22 +9,22 @@ import torch
 from siamese_worlds import SMALL, masked, small_network
 
 from vslam.loopclosure.siamese.images import to_size
-from vslam.loopclosure.training import capsules
-from vslam.loopclosure.training.branches import (
+from vslam.support.errors import InputError
+from vslam_lab.training import capsules
+from vslam_lab.training.branches import (
     CapsuleShape,
     standardised,
     textured,
 )
-from vslam.loopclosure.training.extractors import LIGHT_BLOCKS, grid_side
-from vslam.loopclosure.training.preprocessing import to_tensor
-from vslam.loopclosure.training.pruning import lowest, mean_couplings, pruned
-from vslam.loopclosure.training.siamese import (
+from vslam_lab.training.extractors import LIGHT_BLOCKS, grid_side
+from vslam_lab.training.preprocessing import to_tensor
+from vslam_lab.training.pruning import lowest, mean_couplings, pruned
+from vslam_lab.training.siamese import (
     build_network,
     for_inference,
     load_network,
     save_network,
 )
-from vslam.support.errors import InputError
 
 
 def images(n: int = 3, pixels: int = 64, seed: int = 0) -> torch.Tensor:

@@ -20,7 +20,7 @@ import pytest
 from test_report import make_outcome
 
 from vslam.cli import main as cli
-from vslam.cli import options, train
+from vslam.cli import options
 from vslam.cli import run as run_command
 from vslam.config import PRESETS, as_config, changed_thresholds, thresholds_in_words
 from vslam.datasets import open_sequence, png
@@ -48,6 +48,7 @@ from vslam.types.trajectory import (
     write_kitti,
     write_tum,
 )
+from vslam_lab.cli import train
 
 FRAMES = 12
 
@@ -317,7 +318,7 @@ def commands(group: Any, words: str = "vslam") -> Iterator[tuple[str, Any]]:
 def test_every_option_has_a_placeholder_and_a_sentence_that_describes_it():
     from typer.main import get_command
 
-    for words, command in commands(get_command(cli.app)):
+    for words, command in commands(get_command(cli.every_command())):
         for one in command.params:
             assert (one.help or "").endswith("."), f"{words}: {one.name}"
             needs = one.param_type_name == "option" and not one.is_flag
@@ -327,7 +328,10 @@ def test_every_option_has_a_placeholder_and_a_sentence_that_describes_it():
 def test_the_help_of_resume_names_the_options_that_can_be_given_with_it():
     from typer.main import get_command
 
-    options = {one.name: one for one in dict(commands(get_command(cli.app)))["vslam run"].params}
+    options = {
+        one.name: one
+        for one in dict(commands(get_command(cli.every_command())))["vslam run"].params
+    }
     named = set(re.findall(r"--[a-z-]+", options["resume"].help))
     assert named == {options[name].opts[0] for name in run_command._WITH_RESUME - {"resume"}}
 
@@ -370,7 +374,7 @@ def test_the_choices_of_detectors_are_those_of_the_registry():
 
 
 def test_the_choices_of_presets_are_those_of_the_settings():
-    from vslam.loopclosure.training.settings import PRESETS
+    from vslam_lab.training.settings import PRESETS
 
     assert set(get_args(train.PresetName)) == set(PRESETS)
 
@@ -795,7 +799,7 @@ def test_defects_are_not_dressed_up_as_bad_input(call, monkeypatch):
     def broken() -> None:
         raise ZeroDivisionError("no frames")
 
-    monkeypatch.setattr(cli, "app", broken)
+    monkeypatch.setattr(cli, "every_command", lambda: broken)
     code, _, err = call("info")
     assert code == 1
     assert "no frames: this is a fault of vslam or of the machine; please report it" in err

@@ -16,10 +16,10 @@ import pytest
 from stub_runner import COMMAND, started, wait_for
 
 from vslam.config import Config
-from vslam.lab.bench import execute
-from vslam.lab.bench.cluster import run_on_cluster
-from vslam.lab.bench.grid import make_grid
 from vslam.support.errors import InputError
+from vslam_lab.bench import execute
+from vslam_lab.bench.cluster import run_on_cluster
+from vslam_lab.bench.grid import make_grid
 
 CONFIG = Config().model_dump_json(indent=2) + "\n"
 CELLS = make_grid("kitti", ["00", "05"], ["none", "brightness:1"], ["none", "bow"], 1)
@@ -97,7 +97,7 @@ def test_leaving_stops_the_workers_runs(cluster, stub: Path, tmp_path: Path):
 
 @pytest.mark.slow
 def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("vslam.lab.bench.cluster._CONNECT_S", 1)
+    monkeypatch.setattr("vslam_lab.bench.cluster._CONNECT_S", 1)
     options = execute.RunOptions(None, CONFIG, 1)
     with (
         pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: no scheduler answers"),
@@ -113,8 +113,8 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
 )
 def test_an_address_that_cannot_be_used_leaves_no_client_behind(address: str, said: str):
     code = (
-        "from vslam.lab.bench.cluster import run_on_cluster\n"
-        "from vslam.lab.bench.execute import RunOptions\n"
+        "from vslam_lab.bench.cluster import run_on_cluster\n"
+        "from vslam_lab.bench.execute import RunOptions\n"
         "from vslam.support.errors import InputError\n"
         "try:\n"
         f"    next(run_on_cluster([], RunOptions(None, '', 1), {address!r}, None))\n"

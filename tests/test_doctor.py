@@ -13,7 +13,7 @@ from conftest import StereoSequence
 from source_files import write_calibration, write_video
 from typer.testing import CliRunner
 
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.config import Config, as_config
 from vslam.datasets.association import Pairing
 from vslam.datasets.euroc import open_euroc
@@ -364,7 +364,7 @@ def test_the_command(kitti_tree, tmp_path):
     page, config = tmp_path / "page.html", tmp_path / "config.json"
     config.write_text('{"orb": {"n_features": 500}}')
     options = ["--config", str(config), "--out", str(page)]
-    done = CliRunner().invoke(app, ["doctor", str(kitti_tree), *options])
+    done = CliRunner().invoke(every_command(), ["doctor", str(kitti_tree), *options])
     assert done.exit_code == 0, done.output
     assert "no faults" in done.output
     text = page.read_text()
@@ -383,7 +383,7 @@ def test_the_command_looks_at_the_beginning_of_a_video(corridor, tmp_path, monke
     config.write_text('{"orb": {"n_features": 500}}')
     options = ["--side-by-side", "--calib", str(calibration), "--config", str(config)]
     page = ["--out", str(tmp_path / "page.html")]
-    done = CliRunner().invoke(app, ["doctor", str(video), *options, *page])
+    done = CliRunner().invoke(every_command(), ["doctor", str(video), *options, *page])
     assert done.exit_code == 0, done.output
     assert "the times of 9 frames increase" in done.output
     assert "10.0 Hz" in done.output
@@ -400,7 +400,7 @@ def test_the_command_looks_at_the_beginning_of_a_video(corridor, tmp_path, monke
 )
 def test_the_command_refuses_the_options_that_a_run_refuses(kitti_tree, tmp_path, words, part):
     words = [*words.split(), "--out", str(tmp_path / "page.html")]
-    done = CliRunner().invoke(app, ["doctor", str(kitti_tree), *words])
+    done = CliRunner().invoke(every_command(), ["doctor", str(kitti_tree), *words])
     assert done.exit_code == 1
     assert part in done.output
 
@@ -410,7 +410,7 @@ def test_the_command_turns_bad_input_into_a_finding(kitti_tree, tmp_path):
     one = "{focal: [240, 240], centre: [320, 240], size: [640, 480]}"
     own.write_text(f"left: {one}\nright: {one}\nbaseline: 0.5\n")
     options = ["--calib", str(own), "--out", str(page)]
-    done = CliRunner().invoke(app, ["doctor", str(kitti_tree), *options])
+    done = CliRunner().invoke(every_command(), ["doctor", str(kitti_tree), *options])
     assert done.exit_code == 1
     assert "made for 640x480 pixels but the images have 480x160" in done.output
     assert "fix: take the calibration of these images" in done.output
@@ -438,7 +438,7 @@ def test_nothing_is_wrong_with_euroc():
 @pytest.mark.slow
 def test_what_was_found_is_said_where_the_page_cannot_be_written(kitti_tree):
     options = ["--seq", "00", "--out", str(kitti_tree / "poses" / "00.txt" / "page.html")]
-    done = CliRunner().invoke(app, ["doctor", str(kitti_tree), *options])
+    done = CliRunner().invoke(every_command(), ["doctor", str(kitti_tree), *options])
     assert "rectification" in done.output
     assert isinstance(done.exception, ResultsError)
 

@@ -22,11 +22,11 @@ from browser import chromium, dumped
 from test_report import make_outcome
 
 from vslam.config import as_config
-from vslam.lab.overview.serve import list_runs, make_server
 from vslam.report.explorer import explorer_data
 from vslam.report.folder import evaluate_run, write_results
 from vslam.run.moments import MomentRecorder
 from vslam.support.errors import InputError
+from vslam_lab.overview.serve import list_runs, make_server
 
 FRAMES = 150
 

@@ -21,7 +21,7 @@ from test_pipeline import run as run_pipeline
 from typer.testing import CliRunner
 
 from vslam.backend.pose_graph import GAP, LOOP, TREE, edge_errors, essential_graph
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.config import PoseGraphConfig, load_config
 from vslam.datasets import open_sequence
 from vslam.maps.colmap import save_colmap
@@ -427,7 +427,7 @@ def test_an_empty_folder_is_filled(tmp_path):
 
 
 def vslam(*words: object) -> str:
-    result = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
+    result = CliRunner().invoke(every_command(), list(map(str, words)), catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.stdout
 
@@ -496,7 +496,7 @@ def test_map_info_tells_depth_from_a_pair(tmp_path):
 
 
 def refusal(*words: object) -> str:
-    result = CliRunner().invoke(app, list(map(str, words)))
+    result = CliRunner().invoke(every_command(), list(map(str, words)))
     assert isinstance(result.exception, InputError), result.output
     assert "\n" not in str(result.exception)
     return str(result.exception)

@@ -305,7 +305,7 @@ def test_the_command_checks(made, figures, monkeypatch, capsys):
 
 
 def test_a_benchmark_becomes_a_table_with_a_row_for_each_run(tmp_path, monkeypatch):
-    from vslam.lab.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
+    from vslam_lab.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
 
     def entry(town: int, ate: float | None) -> RunEntry:
         measures = dict.fromkeys((name for name, *_ in MEASURES), 2.0) | {"ate_rmse_m": ate}

@@ -11,10 +11,10 @@ import pytest
 
 from vslam.calibration.files import read_calibration
 from vslam.datasets.euroc import open_euroc
-from vslam.datasets.synthetic.fisheye import render_fisheye, wide_camera
-from vslam.datasets.synthetic.routes import Route, built_in_route
-from vslam.datasets.synthetic.site import Variation
 from vslam.types.camera import Camera
+from vslam_lab.towns.fisheye import render_fisheye, wide_camera
+from vslam_lab.towns.routes import Route, built_in_route
+from vslam_lab.towns.site import Variation
 
 SMALL = Camera(140.0, 140.0, 119.5, 39.5, 0.5, 240, 80)
 FRAMES = 2

@@ -15,7 +15,7 @@ from test_report import make_outcome
 from typer.testing import CliRunner
 
 from vslam.backend.similarity_graph import GAP_SCALE
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.method.gaps import Gap, GapKind, sentences
 from vslam.report.folder import write_results
 from vslam.slam import Slam
@@ -139,7 +139,9 @@ def test_a_map_that_is_continued_keeps_its_gap(tmp_path):
     """A later drive is found in the part after the gap, whose place in the world is not known."""
     slam, _ = run(EXACT, ROUND[:80], Oracle(EXACT, ROUND[:80]), dark=DARK)
     slam.save(tmp_path / "map.npz")
-    info = CliRunner().invoke(app, ["map", "info", str(tmp_path / "map.npz")], color=False)
+    info = CliRunner().invoke(
+        every_command(), ["map", "info", str(tmp_path / "map.npz")], color=False
+    )
     assert "2, in 2 parts that no loop has joined" in info.output
     frames = [*ROUND[60:75]]
     oracle = Oracle(EXACT, ROUND[:80])

@@ -10,11 +10,15 @@ import pytest
 from scipy.io import savemat
 from siamese_worlds import views
 
-from vslam.loopclosure.siamese.image_source import images_in, read_loop_matrix, undistorted
-from vslam.loopclosure.siamese.kitti_source import relation_of_poses
-from vslam.loopclosure.siamese.pack import write_pack
-from vslam.loopclosure.siamese.source_registry import open_source
-from vslam.loopclosure.training.data import (
+from vslam.support.errors import InputError, UnreadableImageError
+from vslam.support.untrusted import is_image
+from vslam.types.geometry import se3_exp
+from vslam.types.trajectory import write_kitti
+from vslam_lab.sources.image_source import images_in, read_loop_matrix, undistorted
+from vslam_lab.sources.kitti_source import relation_of_poses
+from vslam_lab.sources.pack import write_pack
+from vslam_lab.sources.source_registry import open_source
+from vslam_lab.training.data import (
     Collection,
     divide,
     draw_pairs,
@@ -23,10 +27,6 @@ from vslam.loopclosure.training.data import (
     refuse_test_data,
     write_pairs,
 )
-from vslam.support.errors import InputError, UnreadableImageError
-from vslam.support.untrusted import is_image
-from vslam.types.geometry import se3_exp
-from vslam.types.trajectory import write_kitti
 
 
 def write_image(path, grey=100, size=(48, 32)):

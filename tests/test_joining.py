@@ -10,7 +10,7 @@ import pytest
 from ring import CAMERA, LAP, Ring
 from typer.testing import CliRunner
 
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.config import Config
 from vslam.loopclosure.registry import create_detector
 from vslam.maps.storage import load_map, save_map
@@ -199,7 +199,7 @@ def files(drives, elsewhere, tmp_path_factory) -> list[Path]:
 
 
 def run(*words: object):
-    return CliRunner().invoke(app, list(map(str, words)))
+    return CliRunner().invoke(every_command(), list(map(str, words)))
 
 
 def refusal(*words: object) -> str:

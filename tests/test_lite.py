@@ -11,12 +11,12 @@ from siamese_worlds import small_settings, views
 from torch.nn import functional
 
 from vslam.loopclosure.siamese.images import turn_homography
-from vslam.loopclosure.training.branches import CapsuleBranch, CapsuleShape, Layout
-from vslam.loopclosure.training.initial_network import resized, starting_network
-from vslam.loopclosure.training.lite import LiteExtractor
-from vslam.loopclosure.training.siamese import load_network
-from vslam.loopclosure.training.training import train
 from vslam.support.errors import InputError
+from vslam_lab.training.branches import CapsuleBranch, CapsuleShape, Layout
+from vslam_lab.training.initial_network import resized, starting_network
+from vslam_lab.training.lite import LiteExtractor
+from vslam_lab.training.siamese import load_network
+from vslam_lab.training.training import train
 
 # Input, output, expansion, stride and kernel of every block of EfficientNet-Lite0 up to stride 16
 # (Tan and Le, ICML 2019, table 1).

@@ -13,8 +13,8 @@ from vslam.loopclosure.local_matching import positions
 from vslam.loopclosure.siamese import local_descriptors
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors, resized
 from vslam.loopclosure.siamese.weights import SHIPPED
-from vslam.loopclosure.training.siamese import load_network
 from vslam.support.errors import InputError
+from vslam_lab.training.siamese import load_network
 
 
 @pytest.fixture(scope="module")

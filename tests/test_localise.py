@@ -14,7 +14,7 @@ import pytest
 from ring import CAMERA, LAP, Ring
 from typer.testing import CliRunner
 
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.config import Config
 from vslam.evaluation.map_alignment import name_of_world
 from vslam.loopclosure.registry import create_detector
@@ -259,7 +259,7 @@ def test_the_same_bytes_with_one_thread_and_two(file, ring, localize):
 
 
 def vslam(*words: object):
-    return CliRunner().invoke(app, [*map(str, words)])
+    return CliRunner().invoke(every_command(), [*map(str, words)])
 
 
 def report_of(folder: Path) -> dict:

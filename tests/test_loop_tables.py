@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from vslam.lab.loopbench.curves import draw_curves
-from vslam.lab.loopbench.schema import (
+from vslam_lab.loopbench.curves import draw_curves
+from vslam_lab.loopbench.schema import (
     Cost,
     Curve,
     DecisionCurve,

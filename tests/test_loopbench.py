@@ -18,13 +18,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from vslam.cli.main import app
-from vslam.datasets.synthetic import store
-from vslam.lab.loopbench import report as reporting
-from vslam.lab.loopbench.conditions import Condition, apply, clipped, parse_conditions, turned
-from vslam.lab.loopbench.cost import cost
-from vslam.lab.loopbench.detectors import BowScorer, DetectorSet, LocalDescriptorCache, describe
-from vslam.lab.loopbench.measure import (
+from vslam.cli.main import every_command
+from vslam.loopclosure.vocabulary import load
+from vslam.support.errors import InputError
+from vslam_lab.loopbench import report as reporting
+from vslam_lab.loopbench.conditions import Condition, apply, clipped, parse_conditions, turned
+from vslam_lab.loopbench.cost import cost
+from vslam_lab.loopbench.detectors import BowScorer, DetectorSet, LocalDescriptorCache, describe
+from vslam_lab.loopbench.measure import (
     LENGTH,
     MIN_CONFIRMED,
     TOP,
@@ -35,12 +36,11 @@ from vslam.lab.loopbench.measure import (
     sequence_scores,
     thinned,
 )
-from vslam.lab.loopbench.schema import LoopsJson, Verified
-from vslam.lab.loopbench.sets import QuerySet, TestSet, open_set
-from vslam.loopclosure.precision_recall import average_precision, precision_recall
-from vslam.loopclosure.siamese.image_source import DIFFERENT, SAME, UNKNOWN
-from vslam.loopclosure.vocabulary import load
-from vslam.support.errors import InputError
+from vslam_lab.loopbench.schema import LoopsJson, Verified
+from vslam_lab.loopbench.sets import QuerySet, TestSet, open_set
+from vslam_lab.precision_recall import average_precision, precision_recall
+from vslam_lab.sources.image_source import DIFFERENT, SAME, UNKNOWN
+from vslam_lab.towns import store
 
 
 @contextmanager
@@ -352,7 +352,7 @@ def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):
 )
 def test_command_refuses_in_one_sentence(arguments, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["loops", "bench", *arguments])
+    result = CliRunner().invoke(every_command(), ["loops", "bench", *arguments])
     assert isinstance(result.exception, InputError)
     assert said in str(result.exception)
     assert not list(tmp_path.iterdir())
@@ -364,7 +364,9 @@ def test_command_on_a_rendered_town(tmp_path, monkeypatch):
     arguments = ["--detectors", "bow,capsule", "--perturb", "viewpoint", "--strengths", "1"]
     arguments += ["--quiet"]
     arguments += ["--data", "town:demo[seed=7,places=4]", "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(app, ["loops", "bench", *arguments], catch_exceptions=False)
+    result = CliRunner().invoke(
+        every_command(), ["loops", "bench", *arguments], catch_exceptions=False
+    )
     assert result.exit_code == 0
     found = json.loads((tmp_path / "out" / "loops.json").read_text())
     cells = {(cell["condition"], cell["detector"]): cell for cell in found["cells"]}

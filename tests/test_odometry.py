@@ -15,7 +15,6 @@ from test_pose import CAMERA, TRUTH, observations
 
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import Perturbation
-from vslam.datasets.synthetic import built_in_route
 from vslam.evaluation.odometry import motion_errors
 from vslam.frontend.pose import offset_effect, optimise_pose, pose_covariance
 from vslam.report.figures import draw_figures
@@ -35,6 +34,7 @@ from vslam.types.odometry import (
     relative_covariance,
 )
 from vslam.types.trajectory import Trajectory
+from vslam_lab.towns import built_in_route
 
 MOTION = se3_exp(np.array([0.1, -0.05, -1.0, 0.01, 0.05, -0.02]))
 

@@ -15,12 +15,13 @@ from scipy.io import savemat
 from scipy.sparse import csc_matrix
 from typer.testing import CliRunner
 
-from vslam.cli.main import app
-from vslam.datasets.synthetic import store
-from vslam.lab.loopbench import report as reporting
-from vslam.lab.loopbench.drives import open_drives
-from vslam.lab.loopbench.measure_online import measure_drive
-from vslam.lab.loopbench.online import (
+from vslam.cli.main import every_command
+from vslam.loopclosure.vocabulary import load
+from vslam.support.errors import InputError
+from vslam_lab.loopbench import report as reporting
+from vslam_lab.loopbench.drives import open_drives
+from vslam_lab.loopbench.measure_online import measure_drive
+from vslam_lab.loopbench.online import (
     Decisions,
     Window,
     decide,
@@ -28,18 +29,17 @@ from vslam.lab.loopbench.online import (
     judge,
     parse_window,
 )
-from vslam.lab.loopbench.schema import LoopsJson
-from vslam.loopclosure.precision_recall import max_f1, recall_at_full_precision
-from vslam.loopclosure.siamese.image_source import (
+from vslam_lab.loopbench.schema import LoopsJson
+from vslam_lab.precision_recall import max_f1, recall_at_full_precision
+from vslam_lab.sources.image_source import (
     DIFFERENT,
     SAME,
     UNKNOWN,
     ImageSource,
     read_loop_matrix,
 )
-from vslam.loopclosure.siamese.source_registry import open_source
-from vslam.loopclosure.vocabulary import load
-from vslam.support.errors import InputError
+from vslam_lab.sources.source_registry import open_source
+from vslam_lab.towns import store
 
 TRUTH = Path(__file__).parents[2] / "shared/data/loop_ground_truth"
 
@@ -328,7 +328,7 @@ def test_a_drive_is_measured_before_and_after_verification_and_reported(tmp_path
 )
 def test_command_refuses_in_one_sentence(arguments, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["loops", "bench", *arguments])
+    result = CliRunner().invoke(every_command(), ["loops", "bench", *arguments])
     assert isinstance(result.exception, InputError)
     assert said in str(result.exception)
     assert not list(tmp_path.iterdir())
@@ -340,7 +340,9 @@ def test_command_on_a_rendered_drive(tmp_path, monkeypatch):
     arguments = ["--protocol", "online", "--detectors", "bow,capsule", "--quiet"]
     arguments += ["--data", "drive:block[seed=7,every=14]", "--window", "10s"]
     arguments += ["--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(app, ["loops", "bench", *arguments], catch_exceptions=False)
+    result = CliRunner().invoke(
+        every_command(), ["loops", "bench", *arguments], catch_exceptions=False
+    )
     assert result.exit_code == 0
     found = json.loads((tmp_path / "out" / "loops.json").read_text())
     assert found["cells"] == found["costs"] == []

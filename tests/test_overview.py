@@ -20,11 +20,16 @@ from vslam import METHOD_VERSION
 from vslam.cli import main as cli
 from vslam.config import Config
 from vslam.evaluation.trajectories import evaluate_trajectory
-from vslam.lab.overview import figures
-from vslam.lab.overview.collect import Found, collect, read_aligned
-from vslam.lab.overview.render import overview_page, write_overview
-from vslam.lab.overview.schema import ALL, MEASURES, Drive, OverviewJson, RunEntry, Spread
-from vslam.lab.overview.summary import (
+from vslam.report.page import Table
+from vslam.report.render import show
+from vslam.report.schema import DetectorFigures
+from vslam.support.errors import InputError
+from vslam.types.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
+from vslam_lab.overview import figures
+from vslam_lab.overview.collect import Found, collect, read_aligned
+from vslam_lab.overview.render import overview_page, write_overview
+from vslam_lab.overview.schema import ALL, MEASURES, Drive, OverviewJson, RunEntry, Spread
+from vslam_lab.overview.summary import (
     compare,
     least_pairs,
     make_rows,
@@ -32,12 +37,7 @@ from vslam.lab.overview.summary import (
     summarize,
     systems,
 )
-from vslam.lab.overview.versus import versus
-from vslam.report.page import Table
-from vslam.report.render import show
-from vslam.report.schema import DetectorFigures
-from vslam.support.errors import InputError
-from vslam.types.trajectory import Trajectory, read_trajectory, write_kitti, write_tum
+from vslam_lab.overview.versus import versus
 
 LAWS = ("none", "brightness:0.5", "brightness:1")
 

@@ -16,7 +16,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-PARTS = ("vslam", "frontend", "backend", "loopclosure")
+PARTS = ("vslam", "frontend", "backend", "loopclosure", "tools/vslam_lab")
+# Only training and experiments need these; they stay in the repository.
+NOT_SHIPPED = {".safetensors", "capsule-pruned.onnx"}
 
 
 def build(source: Path, out: Path) -> Path:
@@ -45,7 +47,7 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
             shutil.copyfile(ROOT / name, source / name)
         for name in PARTS:
             ignored = shutil.ignore_patterns("__pycache__")
-            shutil.copytree(ROOT / name, source / name, ignore=ignored)
+            shutil.copytree(ROOT / name, source / name, ignore=ignored, dirs_exist_ok=True)
         for path in source.rglob("*"):
             os.utime(path, (1e9 + 1e6 * number, 1e9 + 1e6 * number))
         made.append(build(source, root / f"wheel{number}"))
@@ -70,15 +72,17 @@ def test_the_wheel_holds_every_source_and_the_files_beside_them(wheels):
                 ".npy",
                 ".npz",
                 ".onnx",
-                ".safetensors",
                 ".typed",
             }:
                 continue
-            name = path.relative_to(ROOT).as_posix()
-            name = name if part == "vslam" else f"vslam/{name}"
+            if {path.name, path.suffix} & NOT_SHIPPED:
+                continue
+            name = path.relative_to(ROOT).as_posix().removeprefix("tools/")
+            name = name if name.startswith("vslam") else f"vslam/{name}"
             missing += [] if name in inside else [name]
     assert missing == []
     assert not {name for name in inside if "tests/" in name or name.endswith(".pyc")}
+    assert not {name for name in inside if name.endswith(tuple(NOT_SHIPPED))}
 
 
 @pytest.mark.slow
@@ -153,8 +157,8 @@ def test_a_plain_installation_stays_lean():
     for library, extra, where in (
         ("rosbags", "bag", "vslam/datasets/bag_files.py"),
         ("pymap3d", "gps", "vslam/datasets/fixes.py"),
-        ("distributed", "cluster", "vslam/lab/bench/cluster.py"),
-        ("torch", "train", "vslam/cli/train.py"),
+        ("distributed", "cluster", "tools/vslam_lab/bench/cluster.py"),
+        ("torch", "train", "tools/vslam_lab/cli/train.py"),
     ):
         assert library in extras
         assert f"vslam[{extra}]" in (ROOT / where).read_text()
@@ -186,9 +190,9 @@ def test_the_image_is_not_root_and_copies_what_exists():
     (command,) = re.findall(r"docker run .* vslam (run .*)", comment)
     from typer.main import get_command
 
-    from vslam.cli.main import app
+    from vslam.cli.main import every_command
 
-    known = {o for p in get_command(app).commands["run"].params for o in p.opts}  # type: ignore[attr-defined]
+    known = {o for p in get_command(every_command()).commands["run"].params for o in p.opts}  # type: ignore[attr-defined]
     assert {word for word in command.split() if word.startswith("--")} <= known
     (compiling,) = (rest for word, rest in steps if word == "RUN" and "compile_kernels" in rest)
     assert "chmod -R a+rwX /cache/*" in compiling  # any --user must be able to write there

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from sklearn.metrics import average_precision_score, balanced_accuracy_score, precision_recall_curve
 
-from vslam.loopclosure.precision_recall import (
+from vslam.support.errors import InputError
+from vslam_lab.precision_recall import (
     accepted_at,
     average_precision,
     balanced_accuracy,
@@ -17,7 +18,6 @@ from vslam.loopclosure.precision_recall import (
     summary,
     top_k_precision_recall,
 )
-from vslam.support.errors import InputError
 
 # 5 true pairs of 8; two scores tie.
 SAME = np.array([1, 1, 0, 1, 1, 0, 0, 1], bool)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from vslam.loopclosure.training.preprocessing import Unrolling
+from vslam_lab.training.preprocessing import Unrolling
 
 SIZE, HALF_ANGLE = (97, 217), 40.0
 

@@ -50,6 +50,7 @@ class _Sequence:
     dataset: str = "kitti"
     camera: Camera = CAMERA
     name: str = "00"
+    world: str = ""
 
     def __len__(self) -> int:
         return len(self.timestamps)

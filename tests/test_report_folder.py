@@ -55,6 +55,7 @@ class _Sequence:
     timestamps: np.ndarray = field(default_factory=lambda: 0.1 * np.arange(5))
     ground_truth: np.ndarray | None = None
     camera: Camera = CAMERA
+    world: str = ""
 
 
 def test_ground_truth_of_just_the_frames_done(tmp_path):

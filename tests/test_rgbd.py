@@ -11,14 +11,11 @@ import pytest
 from conftest import StereoSequence, corridor_depth
 from source_files import run_source
 
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.config import Config, DepthConfig, KeyframeConfig
 from vslam.datasets import open_sequence
 from vslam.datasets.association import Pairing, associate
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.datasets.synthetic.layouts import render_rgbd
-from vslam.datasets.synthetic.routes import built_in_route
-from vslam.datasets.synthetic.site import Variation
 from vslam.datasets.tum import open_tum
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.frontend.depth import columns_of_depth
@@ -34,6 +31,9 @@ from vslam.support.errors import InputError, UnreadableImageError
 from vslam.types.camera import Camera
 from vslam.types.context import Context
 from vslam.types.trajectory import Trajectory, write_kitti, write_tum
+from vslam_lab.towns.layouts import render_rgbd
+from vslam_lab.towns.routes import built_in_route
+from vslam_lab.towns.site import Variation
 
 REAL = Path(__file__).parents[2] / "shared/data/tum/rgbd_dataset_freiburg1_desk"
 SCALE = 1000.0
@@ -405,7 +405,9 @@ def test_a_map_keeps_its_camera(outcome, tmp_path):
 def test_the_command_names_the_sensor(tree, tmp_path, capsys):
     def call(*words: str) -> tuple[int, str]:
         with pytest.raises(SystemExit) as stopped:
-            app(["run", "--data", str(tree), "--out", str(tmp_path), "--no-record", *words])
+            every_command()(
+                ["run", "--data", str(tree), "--out", str(tmp_path), "--no-record", *words]
+            )
         captured = capsys.readouterr()
         return int(stopped.value.code or 0), captured.out + captured.err
 

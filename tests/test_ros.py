@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from test_pipeline import run as run_pipeline
 from typer.testing import CliRunner
 
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.maps.ros import (
     T_BASE_OPTICAL,
     TOPICS,
@@ -51,7 +51,7 @@ def folder(kitti_tree, tmp_path_factory) -> Path:
 
 
 def export(*words: object) -> str:
-    done = CliRunner().invoke(app, ["export", "ros", *map(str, words)])
+    done = CliRunner().invoke(every_command(), ["export", "ros", *map(str, words)])
     if done.exception is not None:
         raise done.exception
     return done.output

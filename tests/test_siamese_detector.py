@@ -19,25 +19,14 @@ from onnx import TensorProto, helper
 from siamese_worlds import small_network, small_settings, views
 from typer.testing import CliRunner
 
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.config import Config, SiameseConfig
-from vslam.lab.loopbench.detectors import NetworkScorer
 from vslam.loopclosure.reach import beyond_reach, within_reach
 from vslam.loopclosure.registry import detector_with_images
 from vslam.loopclosure.siamese.detector import SiameseDetector, open_detector
 from vslam.loopclosure.siamese.inference import LateNetwork, OnnxNetwork, open_network
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
 from vslam.loopclosure.siamese.weights import SHIPPED
-from vslam.loopclosure.training import export
-from vslam.loopclosure.training.export import (
-    SIMILARITY_TOLERANCE,
-    TOLERANCE,
-    export_onnx,
-    to_onnx,
-    write_onnx,
-)
-from vslam.loopclosure.training.preprocessing import to_tensor
-from vslam.loopclosure.training.siamese import for_inference, load_network
 from vslam.loopclosure.verifier import Verifier
 from vslam.method.closing import LoopClosing
 from vslam.support.errors import InputError, ResultsError
@@ -46,6 +35,17 @@ from vslam.types.features import Features
 from vslam.types.loops import LastSeen
 from vslam.types.map import PREDICTED, UNPREDICTED, Map
 from vslam.types.map_kernels import link
+from vslam_lab.loopbench.detectors import NetworkScorer
+from vslam_lab.training import export
+from vslam_lab.training.export import (
+    SIMILARITY_TOLERANCE,
+    TOLERANCE,
+    export_onnx,
+    to_onnx,
+    write_onnx,
+)
+from vslam_lab.training.preprocessing import to_tensor
+from vslam_lab.training.siamese import for_inference, load_network
 
 
 def features(n: int) -> Features:
@@ -340,7 +340,7 @@ def test_a_run_takes_the_weights_of_a_file(kitti_tree, tmp_path):
     settings.write_text(Config(siamese=SiameseConfig(threshold=0.0)).model_dump_json())
     words = ["run", "--data", str(kitti_tree), "--detector", "capsule", "--weights", str(path)]
     words += ["--config", str(settings), "--no-record", "--quiet", "--out", str(tmp_path)]
-    done = CliRunner().invoke(app, words)
+    done = CliRunner().invoke(every_command(), words)
     assert done.exit_code == 0, done.output
     report = json.loads((tmp_path / "latest" / "report.json").read_text())
     assert (report["detector"], report["weights"]) == ("capsule", str(path))
@@ -401,7 +401,7 @@ def test_train_writes_weights_and_card(tmp_path):
     settings.write_text(small_settings(epochs=1, seed=3).model_dump_json())
     out = tmp_path / "out"
     command = ["train", "capsule", "--data", f"pairs:{data}", "--settings", str(settings)]
-    done = CliRunner().invoke(app, [*command, "--out", str(out), "--threads", "1"])
+    done = CliRunner().invoke(every_command(), [*command, "--out", str(out), "--threads", "1"])
     assert done.exit_code == 0, done.output
     assert "average_precision" in done.stdout
     files = {path.name for path in out.iterdir()}
@@ -412,11 +412,11 @@ def test_train_writes_weights_and_card(tmp_path):
     # Without settings, training uses the image size of the weights.
     command = ["train", "capsule-pruned", "--data", f"pairs:{data}", "--weights", str(full)]
     command += ["--pairs", "16", "--epochs", "1", "--out", str(tmp_path / "p"), "--threads", "1"]
-    done = CliRunner().invoke(app, command)
+    done = CliRunner().invoke(every_command(), command)
     assert done.exit_code == 0, done.output
     assert load_network(tmp_path / "p" / "capsule-pruned.safetensors")[0].size == (64, 64)
     done = CliRunner().invoke(
-        app, ["export", "weights", "--weights", str(full), "--out", str(shipped)]
+        every_command(), ["export", "weights", "--weights", str(full), "--out", str(shipped)]
     )
     assert done.exit_code == 0, done.output
     assert shipped.stat().st_size < 0.6 * full.stat().st_size
@@ -433,7 +433,7 @@ def test_train_refuses_a_file_as_its_folder_before_it_reads_images(tmp_path):
     file = tmp_path / "notes.txt"
     file.write_text("mine")
     command = ["train", "capsule", "--data", "pairs:nowhere", "--out", str(file)]
-    done = CliRunner().invoke(app, command)
+    done = CliRunner().invoke(every_command(), command)
     assert "notes.txt: cannot be written (Not a directory); give another" in str(done.exception)
 
 

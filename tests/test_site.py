@@ -108,11 +108,11 @@ def test_no_page_asks_another_host(pages, site):
 def test_the_reference_has_every_command_and_option(site):
     from typer.main import get_command
 
-    from vslam.cli.main import app
+    from vslam.cli.main import every_command
     from vslam.cli.options import DetectorName
 
     text = (site / "reference" / "commands.html").read_text()
-    run = get_command(app).commands["run"]  # type: ignore[attr-defined]
+    run = get_command(every_command()).commands["run"]  # type: ignore[attr-defined]
     assert all(option in text for parameter in run.params for option in parameter.opts)
     assert all(name in text for name in get_args(DetectorName))
     assert 'id="vslam-loops-bench"' in text
@@ -139,10 +139,10 @@ def vslam_commands(text: str) -> list[list[str]]:
 def test_commands_on_pages_exist_with_their_options(path: Path):
     from typer.main import get_command
 
-    from vslam.cli.main import app
+    from vslam.cli.main import every_command
 
     for words in vslam_commands(path.read_text()):
-        command, rest = get_command(app), [word.rstrip(";") for word in words[1:]]
+        command, rest = get_command(every_command()), [word.rstrip(";") for word in words[1:]]
         while getattr(command, "commands", None) and rest and not rest[0].startswith("-"):
             assert rest[0] in command.commands, words  # type: ignore[attr-defined]
             command = command.commands[rest.pop(0)]  # type: ignore[attr-defined]

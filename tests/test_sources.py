@@ -35,7 +35,7 @@ from source_files import (
 from test_security import png
 from typer.testing import CliRunner
 
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.datasets import open_sequence
 from vslam.datasets.bag_messages import grey_of
 from vslam.datasets.detection import detect_dataset
@@ -43,7 +43,6 @@ from vslam.datasets.frames import Source, TimedFrame, selected
 from vslam.datasets.image_folders import open_images
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.datasets.sources import SourceOptions
-from vslam.datasets.synthetic.layouts import write_side_by_side
 from vslam.report.folder import create_run_folder
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
@@ -52,6 +51,7 @@ from vslam.run.recorder import Recorder
 from vslam.support.errors import InputError
 from vslam.types.camera import Camera
 from vslam.types.features import TrackingState
+from vslam_lab.towns.layouts import write_side_by_side
 
 FRAMES = 12
 STAMPS = [k * 10**8 for k in range(FRAMES)]
@@ -401,7 +401,7 @@ def test_command_line_finds_out_what_it_is_given(folder, tmp_path):
 def test_a_contact_sheet_of_a_video(folder, tmp_path):
     words = ["perturb", folder / "pair.mkv", "--side-by-side", "--calib", folder / "stereo.yaml"]
     words += ["--perturb", "blur", "--frames", "2", "--start", "3", "--out", tmp_path / "a.png"]
-    done = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
+    done = CliRunner().invoke(every_command(), list(map(str, words)), catch_exceptions=False)
     assert f"frames 3, {FRAMES - 1}" in done.output
     assert cv2.imread(str(tmp_path / "a.png")).shape == (2 * (160 + 30), 4 * (480 + 8), 3)
 
@@ -412,7 +412,7 @@ def test_a_stress_test_of_a_video(folder, tmp_path):
     words = ["stress", folder / "pair.mkv", "--side-by-side", "--calib", folder / "stereo.yaml"]
     words += ["--laws", "bias,desync", "--detectors", "none", "--seeds", "1", "--steps", "1"]
     words += ["--max-frames", "8", "--out", tmp_path / "stress"]
-    done = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
+    done = CliRunner().invoke(every_command(), list(map(str, words)), catch_exceptions=False)
     assert "finished 1 of 1 searches" in done.output
     report = json.loads((tmp_path / "stress" / "stress.json").read_text())
     assert [(b["sequence"], b["law"]) for b in report["boundaries"]] == [("pair", "bias")]
@@ -422,7 +422,7 @@ def test_a_stress_test_of_a_video(folder, tmp_path):
 def test_other_systems_are_not_tested_on_videos(folder, tmp_path):
     words = ["stress", folder / "pair.mkv", "--side-by-side", "--calib", folder / "stereo.yaml"]
     words += ["--systems", "mine", "--system", "mine=mine {folder} {out}", "--out", tmp_path / "a"]
-    done = CliRunner().invoke(app, list(map(str, words)))
+    done = CliRunner().invoke(every_command(), list(map(str, words)))
     assert "--systems mine: other systems read KITTI's format" in str(done.exception)
 
 

@@ -11,28 +11,28 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.config import Config
 from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.kitti import open_kitti
 from vslam.datasets.perturbation import LAWS, parse_perturbation, sheet_of_laws
-from vslam.lab.bench.execute import Failed, Finished
-from vslam.lab.bench.grid import Cell, make_grid
-from vslam.lab.stress.criterion import Criterion, absolute_verdict
-from vslam.lab.stress.external import check_template, export_kitti, run_external
-from vslam.lab.stress.figures import draw_curves
-from vslam.lab.stress.kitti_c import CORRUPTIONS
-from vslam.lab.stress.orbslam3 import _moved_with_keyframes
-from vslam.lab.stress.plan import Plan, parse_laws
-from vslam.lab.stress.report import boundary_sections, render_csv, title, write_report
-from vslam.lab.stress.report import cell as cell_text
-from vslam.lab.stress.run import Results, run_all
-from vslam.lab.stress.search import boundary, next_position, strength_at
-from vslam.lab.stress.summary import corruption_entries, mean_error, summarise
 from vslam.report.schema import Machine, ReportJson
 from vslam.run.options import RunOptions
 from vslam.support.errors import InputError
 from vslam.types.camera import Camera
+from vslam_lab.bench.execute import Failed, Finished
+from vslam_lab.bench.grid import Cell, make_grid
+from vslam_lab.stress.criterion import Criterion, absolute_verdict
+from vslam_lab.stress.external import check_template, export_kitti, run_external
+from vslam_lab.stress.figures import draw_curves
+from vslam_lab.stress.kitti_c import CORRUPTIONS
+from vslam_lab.stress.orbslam3 import _moved_with_keyframes
+from vslam_lab.stress.plan import Plan, parse_laws
+from vslam_lab.stress.report import boundary_sections, render_csv, title, write_report
+from vslam_lab.stress.report import cell as cell_text
+from vslam_lab.stress.run import Results, run_all
+from vslam_lab.stress.search import boundary, next_position, strength_at
+from vslam_lab.stress.summary import corruption_entries, mean_error, summarise
 
 CONFIG = Config().model_dump_json(indent=2) + "\n"
 
@@ -560,7 +560,7 @@ rows = [f"1 0 0 {0.1 * (i % 3) + far * (i % 2)} 0 1 0 0 0 0 1 {i}" for i in k]
         "--system", f"ruler={sys.executable} {script} {{folder}} {{out}}", "--laws", "night",
         "--steps", "2", "--seeds", "1", "--out", str(tmp_path / "out"), "--quiet",
     ]  # fmt: skip
-    done = CliRunner().invoke(app, words)
+    done = CliRunner().invoke(every_command(), words)
     assert done.exit_code == 0, done.output
     report = json.loads((tmp_path / "out" / "stress.json").read_text())
     (entry,) = report["boundaries"]
@@ -568,7 +568,7 @@ rows = [f"1 0 0 {0.1 * (i % 3) + far * (i % 2)} 0 1 0 0 0 0 1 {i}" for i in k]
     assert entry["fails_at"] == 2.5
     assert entry["reason"].startswith("ATE")
     first = (tmp_path / "out" / "stress.json").read_bytes()
-    assert CliRunner().invoke(app, words).exit_code == 0
+    assert CliRunner().invoke(every_command(), words).exit_code == 0
     assert (tmp_path / "out" / "stress.json").read_bytes() == first
 
 
@@ -586,7 +586,7 @@ rows = [f"1 0 0 {0.1 * (i % 3) + far * (i % 2)} 0 1 0 0 0 0 1 {i}" for i in k]
 def test_stress_refuses_before_it_starts(tmp_path, words, said):
     root = make_kitti(tmp_path / "data")
     arguments = ["stress", "--data", str(root), "--out", str(tmp_path / "out"), *words.split()]
-    done = CliRunner().invoke(app, arguments)
+    done = CliRunner().invoke(every_command(), arguments)
     assert isinstance(done.exception, InputError)
     assert said in str(done.exception)
     assert not (tmp_path / "out").exists()

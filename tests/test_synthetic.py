@@ -17,30 +17,30 @@ import pytest
 from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.datasets import open_sequence
 from vslam.datasets.kitti import open_kitti
-from vslam.datasets.synthetic import parse_drive, store, textures, vehicles
-from vslam.datasets.synthetic import town as town_module
-from vslam.datasets.synthetic.files import lock_of
-from vslam.datasets.synthetic.pairs import render_pairs
-from vslam.datasets.synthetic.passes import Passes, pass_starts
-from vslam.datasets.synthetic.render import Light, Moment, Renderer, sensor_image
-from vslam.datasets.synthetic.routes import (
+from vslam.support.errors import InputError
+from vslam.support.machine import has_avx2
+from vslam.types.camera import Camera
+from vslam_lab.loopbench.drives import render_views
+from vslam_lab.towns import parse_drive, store, textures, vehicles
+from vslam_lab.towns import town as town_module
+from vslam_lab.towns.files import lock_of
+from vslam_lab.towns.pairs import render_pairs
+from vslam_lab.towns.passes import Passes, pass_starts
+from vslam_lab.towns.render import Light, Moment, Renderer, sensor_image
+from vslam_lab.towns.routes import (
     CAMERA_HEIGHT,
     ROUTES,
     built_in_route,
     route_of_poses,
 )
-from vslam.datasets.synthetic.scene import AtlasBuilder, join, patches
-from vslam.datasets.synthetic.shadows import cast_shadows, lamp_pools
-from vslam.datasets.synthetic.site import ALIASES, Variation
-from vslam.datasets.synthetic.solids import turn
-from vslam.datasets.synthetic.town import build_town
-from vslam.lab.loopbench.drives import render_views
-from vslam.support.errors import InputError
-from vslam.support.machine import has_avx2
-from vslam.types.camera import Camera
+from vslam_lab.towns.scene import AtlasBuilder, join, patches
+from vslam_lab.towns.shadows import cast_shadows, lamp_pools
+from vslam_lab.towns.site import ALIASES, Variation
+from vslam_lab.towns.solids import turn
+from vslam_lab.towns.town import build_town
 
 CAMERA = Camera(360.0, 360.0, 300.3, 95.7, 0.54, 620, 190)
 BY_DAY = Light(np.array([0.0, -0.8, -0.6]), visibility=1e9, haze=0.0)
@@ -641,11 +641,11 @@ def test_a_name_says_how_the_town_varies():
 def test_a_drive_with_a_name_of_its_own_is_that_route_in_that_town(tmp_path, monkeypatch):
     monkeypatch.setenv("VSLAM_CACHE", str(tmp_path))
     words = ["synth", "night", "--max-frames", "1"]
-    done = CliRunner().invoke(app, words)
+    done = CliRunner().invoke(every_command(), words)
     assert done.exit_code == 0, done.output
     folder = tmp_path / "synthetic" / "v2-seed1-change1"
     assert done.stdout.startswith(f"{folder}: ")
-    assert CliRunner().invoke(app, [*words, "--quiet"]).output == ""
+    assert CliRunner().invoke(every_command(), [*words, "--quiet"]).output == ""
     assert [path.name for path in (folder / "sequences").iterdir()] == ["lane"]
     found = open_sequence("synthetic", None, "night", max_frames=1)
     assert (found.name, found.dataset, len(found)) == ("night", "synthetic", 1)
@@ -657,7 +657,7 @@ def test_a_drive_with_a_name_of_its_own_is_that_route_in_that_town(tmp_path, mon
 )
 def test_moves_beyond_the_road_are_refused_before_rendering(tmp_path, pairs, option, why):
     words = ["synth", "demo", *pairs, option, "--out", str(tmp_path / "out")]
-    assert why in str(CliRunner().invoke(app, words).exception)
+    assert why in str(CliRunner().invoke(every_command(), words).exception)
     assert not (tmp_path / "out").exists()
 
 
@@ -666,7 +666,7 @@ def test_a_route_is_the_same_on_cpus_with_and_without_avx512():
     """On a CPU with AVX-512, OpenBLAS would use kernels that round differently."""
     code = (
         "from vslam.support.machine import set_up_openblas; set_up_openblas();"
-        "from vslam.datasets.synthetic.routes import built_in_route;"
+        "from vslam_lab.towns.routes import built_in_route;"
         "print(built_in_route('01').T_wc.tobytes().hex())"
     )
     given = {key: os.environ[key] for key in os.environ if key != "OPENBLAS_CORETYPE"}

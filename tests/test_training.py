@@ -11,27 +11,27 @@ import pytest
 import torch
 from siamese_worlds import SMALL, small_network, small_settings, views
 
-from vslam.loopclosure.precision_recall import average_precision, precision_recall
-from vslam.loopclosure.training import training
-from vslam.loopclosure.training.augmentation import STRONG, Augmentation, augment
-from vslam.loopclosure.training.branches import Layout
-from vslam.loopclosure.training.checkpoint import CHECKPOINT
-from vslam.loopclosure.training.data import draw_pairs
-from vslam.loopclosure.training.initial_network import resized, starting_network
-from vslam.loopclosure.training.model_card import describe, write_card
-from vslam.loopclosure.training.objective import (
+from vslam.support.errors import InputError, ResultsError
+from vslam_lab.precision_recall import average_precision, precision_recall
+from vslam_lab.training import training
+from vslam_lab.training.augmentation import STRONG, Augmentation, augment
+from vslam_lab.training.branches import Layout
+from vslam_lab.training.checkpoint import CHECKPOINT
+from vslam_lab.training.data import draw_pairs
+from vslam_lab.training.initial_network import resized, starting_network
+from vslam_lab.training.model_card import describe, write_card
+from vslam_lab.training.objective import (
     calibrate,
     contrast,
     cross_entropy,
     embed_all,
     score_matrix,
 )
-from vslam.loopclosure.training.preprocessing import to_tensor
-from vslam.loopclosure.training.pruning import lowest, pruned
-from vslam.loopclosure.training.settings import PRESETS, load_settings
-from vslam.loopclosure.training.siamese import load_network, save_network
-from vslam.loopclosure.training.training import train
-from vslam.support.errors import InputError, ResultsError
+from vslam_lab.training.preprocessing import to_tensor
+from vslam_lab.training.pruning import lowest, pruned
+from vslam_lab.training.settings import PRESETS, load_settings
+from vslam_lab.training.siamese import load_network, save_network
+from vslam_lab.training.training import train
 
 
 @pytest.fixture(autouse=True)

@@ -12,14 +12,15 @@ from pydantic import ValidationError
 from siamese_worlds import SMALL, masked, small_network, small_settings, views
 
 from vslam.loopclosure.siamese.images import parse_size, to_size
-from vslam.loopclosure.training.augmentation import STRONG, augment
-from vslam.loopclosure.training.branches import CapsuleShape, Layout
-from vslam.loopclosure.training.export import export_onnx
-from vslam.loopclosure.training.initial_network import resized, starting_network
-from vslam.loopclosure.training.lite import LiteExtractor
-from vslam.loopclosure.training.preprocessing import Unrolling
-from vslam.loopclosure.training.pruning import lowest, mean_couplings, pruned
-from vslam.loopclosure.training.siamese import (
+from vslam.support.errors import InputError
+from vslam_lab.training.augmentation import STRONG, augment
+from vslam_lab.training.branches import CapsuleShape, Layout
+from vslam_lab.training.export import export_onnx
+from vslam_lab.training.initial_network import resized, starting_network
+from vslam_lab.training.lite import LiteExtractor
+from vslam_lab.training.preprocessing import Unrolling
+from vslam_lab.training.pruning import lowest, mean_couplings, pruned
+from vslam_lab.training.siamese import (
     SiameseNetwork,
     aligned,
     build_network,
@@ -27,8 +28,7 @@ from vslam.loopclosure.training.siamese import (
     load_network,
     save_network,
 )
-from vslam.loopclosure.training.training import train
-from vslam.support.errors import InputError
+from vslam_lab.training.training import train
 
 WIDE = {"pixels": 48, "width": 81, "views": 2, "view_width": 65}
 SHIFT = 16  # columns between the two views of 81

@@ -13,7 +13,7 @@ import pytest
 from conftest import StereoSequence
 from typer.testing import CliRunner
 
-from vslam.cli.main import app
+from vslam.cli.main import every_command
 from vslam.support.errors import InputError
 
 EXTRA = ("torch", "safetensors", "onnx", "onnxscript")
@@ -99,6 +99,6 @@ def test_all_but_training_works_without_torch(kitti_tree: Path, pairs: Path, tmp
 )
 def test_training_looks_for_every_library_before_it_starts(words, missing, monkeypatch):
     monkeypatch.setitem(sys.modules, missing, None)
-    found = CliRunner().invoke(app, words).exception
+    found = CliRunner().invoke(every_command(), words).exception
     assert isinstance(found, InputError)
     assert f"{missing} is not installed; pip install 'vslam[train]'" in str(found)

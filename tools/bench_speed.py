@@ -278,9 +278,9 @@ def figures(run: Run, case: Case, reading: float) -> dict[str, float]:
 
     from vslam.datasets import open_sequence
     from vslam.evaluation.trajectories import evaluate_trajectory
-    from vslam.lab.stress.external import read_poses
     from vslam.support.errors import InputError
     from vslam.types.trajectory import Trajectory
+    from vslam_lab.stress.external import read_poses
 
     process, frames = run.process, run.report["frames"]
     whole, loop = 1e3 * process.cpu_s / frames, run.report["cpu_ms_per_frame"]

@@ -206,8 +206,8 @@ def _is_done(entry: Entry, target: Path, command: str) -> bool:
 
 def _run(entry: Entry, command: str, root: Path, target: Path) -> bool:
     """Run the command of an entry, and copy and stamp its files. Returns whether it succeeded."""
-    from vslam.datasets.synthetic.site import Variation
-    from vslam.datasets.synthetic.store import cache_folder, folder_name
+    from vslam_lab.towns.site import Variation
+    from vslam_lab.towns.store import cache_folder, folder_name
 
     kind = "full" if target == root else "quick"
     out = root / "runs" / "figures" / f"{kind}-{METHOD_VERSION}" / entry.files[0].replace("/", "-")

@@ -191,10 +191,10 @@ def _read_config(folder: Path) -> None:
 
 
 def _read_report(folder: Path) -> None:
-    from vslam.lab.overview.render import write_overview
     from vslam.report.render import html, markdown
     from vslam.report.run_page import run_page
     from vslam.report.schema import ReportJson
+    from vslam_lab.overview.render import write_overview
 
     report = ReportJson.read(folder / "report.json")
     page = run_page(report)
@@ -226,7 +226,7 @@ def _read_onnx(folder: Path) -> None:
 
 
 def _read_weights(folder: Path) -> None:
-    from vslam.loopclosure.training.siamese import load_network
+    from vslam_lab.training.siamese import load_network
 
     load_network(folder / "net.safetensors")
 

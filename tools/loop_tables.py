@@ -10,9 +10,9 @@ import csv
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from vslam.lab.loopbench.curves import draw_curves
-from vslam.lab.loopbench.report import MEAN, top_figures
-from vslam.lab.loopbench.schema import Cost, LoopsJson, OnlineScore, Score
+from vslam_lab.loopbench.curves import draw_curves
+from vslam_lab.loopbench.report import MEAN, top_figures
+from vslam_lab.loopbench.schema import Cost, LoopsJson, OnlineScore, Score
 
 Row = dict[str, str]
 

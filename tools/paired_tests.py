@@ -14,9 +14,9 @@ import csv
 from itertools import combinations
 from pathlib import Path
 
-from vslam.lab.overview.collect import Found
-from vslam.lab.overview.schema import DECIMALS, Comparison, Drive, RunEntry
-from vslam.lab.overview.summary import summarize, systems
+from vslam_lab.overview.collect import Found
+from vslam_lab.overview.schema import DECIMALS, Comparison, Drive, RunEntry
+from vslam_lab.overview.summary import summarize, systems
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ import argparse
 import csv
 from pathlib import Path
 
-from vslam.lab.overview.schema import DECIMALS, OverviewJson, RunEntry
+from vslam_lab.overview.schema import DECIMALS, OverviewJson, RunEntry
 
 
 def main() -> None:

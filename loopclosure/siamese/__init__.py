@@ -1,4 +1,4 @@
 """Runs Siamese networks, without torch, to decide whether two images show the same place.
 
-Training code is in :mod:`vslam.loopclosure.training`.
+Training code is in :mod:`vslam_lab.training`.
 """

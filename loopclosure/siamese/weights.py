@@ -31,6 +31,11 @@ def find_weights(name: str, weights: Path | None = None) -> Path:
     if name not in NETWORKS:
         raise InputError(f"--detector {name}: unknown; choose one of {', '.join(NETWORKS)}.")
     path = weights or SHIPPED / f"{name}.onnx"
+    if not path.exists() and weights is None:
+        raise InputError(
+            f"--detector {name}: its weights are not part of an installed vslam; give the file "
+            f"loopclosure/siamese/weights/{name}.onnx of the repository with --weights."
+        )
     if not path.exists():
         raise InputError(
             f"--weights {path}: no such file; give the .onnx file of a trained network."

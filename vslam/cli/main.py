@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Collection
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Annotated, Any
@@ -16,31 +17,16 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from vslam.cli import (
-    bench,
-    calibrate,
-    doctor,
-    evaluate,
-    export,
-    info,
-    loops,
-    perturb,
-    report,
-    run,
-    stress,
-    synth,
-    train,
-    vocabulary,
-)
+from vslam.cli import calibrate, doctor, evaluate, export, info, perturb, run, vocabulary
 from vslam.cli import map as map_
+from vslam.support import plugins
 from vslam.support.errors import InputError, ResultsError, did_you_mean, plain_reason
 from vslam.support.machine import keep_memory, set_up_openblas
 from vslam.support.plugins import reason
 from vslam.support.untrusted import require_utf8
 
 _GROUPS: tuple[ModuleType, ...] = (
-    run, evaluate, perturb, info, calibrate, doctor, bench, stress, report, synth, train, export,
-    map_, vocabulary, loops,
+    run, evaluate, perturb, info, calibrate, doctor, export, map_, vocabulary
 )  # fmt: skip
 
 
@@ -86,8 +72,8 @@ def _plain(message: str) -> str:
     return f"{word}{found}{choices.rstrip('.')}{meant}."
 
 
-def application(groups: Collection[ModuleType]) -> typer.Typer:
-    """Create a command-line application from the commands that the given modules define."""
+def application(groups: Collection[typer.Typer]) -> typer.Typer:
+    """Create a command-line application from the commands of smaller ones."""
     made = typer.Typer(
         help="Visual SLAM in pure Python.",
         cls=_Group,
@@ -97,8 +83,8 @@ def application(groups: Collection[ModuleType]) -> typer.Typer:
         rich_markup_mode="rich",
     )
     for group in groups:
-        made.add_typer(group.app, cls=_Group)
-        for command in group.app.registered_commands:
+        made.add_typer(group, cls=_Group)
+        for command in group.registered_commands:
             command.cls = _Command
     made.callback(invoke_without_command=True)(version)
     return made
@@ -114,7 +100,11 @@ def version(
         raise typer.Exit
 
 
-app = application(_GROUPS)
+@cache
+def every_command() -> typer.Typer:
+    """Return the application with all commands, those of the laboratory last."""
+    own = [group.app for group in _GROUPS]
+    return application([*own, *plugins.laboratory(plugins.COMMANDS).values()])
 
 
 def _treat_as_ctrl_c(signal_number: int, stack: FrameType | None) -> None:
@@ -140,7 +130,7 @@ def main() -> None:
         with suppress(FileNotFoundError):  # the folder was removed
             require_utf8(Path.cwd())
         # vslam run does not load the other commands, because preparing their options takes 30 ms.
-        (application((run,)) if sys.argv[1:2] == ["run"] else app)()
+        (application([run.app]) if sys.argv[1:2] == ["run"] else every_command())()
     except InputError as error:
         typer.echo(f"error: {error}", err=True)
         sys.exit(2)

@@ -75,9 +75,8 @@ def open_sequence(
             raise InputError(
                 "--calib: rendered towns have their own calibration; leave the option out."
             )
-        from vslam.datasets.synthetic import open_synthetic
-
-        return open_synthetic(_DEFAULT_NAME if name is None else name, on_frame=on_render, **chosen)
+        open_towns = plugins.laboratory(plugins.TOWNS)["synthetic"]
+        return open_towns(_DEFAULT_NAME if name is None else name, on_frame=on_render, **chosen)
     others = plugins.find_plugins(plugins.READERS)
     if dataset not in others:
         known = (*DATASETS, *others)

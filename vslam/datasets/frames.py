@@ -161,6 +161,8 @@ class Source(_Frames):
         warnings: what the report of a run must say about the data, in sentences.
         rectify_mask: function that rectifies an ``(H, W)`` uint8 mask of the original left images.
             None if vslam does not rectify the images.
+        world: name of the world frame of the ground truth, which all drives along a rendered route
+            share. Empty if no other sequence has the same world frame.
 
     Raises:
         InputError: the times of stored frames do not increase.
@@ -168,6 +170,7 @@ class Source(_Frames):
     """
 
     camera: Camera
+    world: str = ""
     rectify_mask: Callable[[Image], Image] | None = None
 
 

@@ -18,16 +18,11 @@ from vslam.types.geometry import Matrix
 def name_of_world(outcome: RunOutcome) -> str:
     """Return the name of the world frame of a run's ground truth.
 
-    It contains the name of the sequence. For rendered drives, it contains the route instead,
-    because all drives along one route have the same world frame, even if the light or the traffic
-    differs.
+    It contains the name of the sequence, or ``Source.world`` if the sequence shares its world frame
+    with others.
     """
-    dataset, name = outcome.sequence.dataset, outcome.sequence.name
-    if dataset == "synthetic":
-        from vslam.datasets.synthetic import parse_drive  # imports the renderer
-
-        name, _ = parse_drive(name)
-    return f"{dataset} {name}"
+    sequence = outcome.sequence
+    return f"{sequence.dataset} {sequence.world or sequence.name}"
 
 
 def truth_alignment_of(outcome: RunOutcome, evaluation: Evaluation) -> TruthAlignment:

@@ -6,6 +6,7 @@ is used, so a broken package does not affect other runs.
 
 from __future__ import annotations
 
+import importlib.metadata
 import logging
 import re
 from collections.abc import Callable, Collection
@@ -20,6 +21,8 @@ from vslam.support.errors import InputError
 DETECTORS = "vslam.detectors"
 READERS = "vslam.readers"
 PERTURBATIONS = "vslam.perturbations"
+COMMANDS = "vslam.commands"  # typer applications of the laboratory
+TOWNS = "vslam.towns"  # the reader of rendered towns
 KINDS = {DETECTORS: "detector", READERS: "reader", PERTURBATIONS: "perturbation"}
 # Commas, colons and plus signs separate names on the command line.
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
@@ -122,6 +125,15 @@ def find_plugins(group: str) -> dict[str, PlugIn]:
             first = found[name].entry_point if name in found else entry_point
             found[name] = PlugIn(group, name, (*others, package), first)
     return dict(sorted(found.items()))
+
+
+def laboratory(group: str) -> dict[str, Any]:
+    """Import what the laboratory (``vslam_lab``) provides in ``COMMANDS`` or ``TOWNS``, by name.
+
+    The laboratory is part of the same distribution, and vslam never imports it otherwise.
+    """
+    points = importlib.metadata.distribution("vslam").entry_points.select(group=group)
+    return {point.name: point.load() for point in points}
 
 
 def packages_of(names: Collection[str]) -> dict[str, str]:

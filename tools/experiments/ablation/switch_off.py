@@ -18,7 +18,7 @@ from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
-from vslam.lab.overview.schema import OverviewJson
+from vslam_lab.overview.schema import OverviewJson
 
 
 class Variant(NamedTuple):

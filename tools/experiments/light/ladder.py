@@ -10,9 +10,9 @@ import argparse
 import csv
 from pathlib import Path
 
-from vslam.lab.stress.criterion import absolute_verdict
 from vslam.report.schema import ReportJson
 from vslam.support.errors import InputError
+from vslam_lab.stress.criterion import absolute_verdict
 
 
 def rows_of(folder: Path) -> list[list[object]]:

@@ -30,16 +30,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.lab.loopbench.detectors import LocalDescriptorCache, NetworkScorer, describe
-from vslam.lab.loopbench.measure import (
+from vslam.loopclosure.local_matching import homography_inliers, match_coarse
+from vslam.loopclosure.vocabulary import load
+from vslam_lab.loopbench.detectors import LocalDescriptorCache, NetworkScorer, describe
+from vslam_lab.loopbench.measure import (
     LEAST_COSINE,
     MIN_CONFIRMED,
     MIN_MATCHES,
     confirmed_cells,
     epipolar_inliers,
 )
-from vslam.loopclosure.local_matching import homography_inliers, match_coarse
-from vslam.loopclosure.vocabulary import load
 
 MIN_CELLS = 90
 WEBCAMS = "webcams"

@@ -22,17 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam import METHOD_VERSION
-from vslam.datasets.synthetic.passes import Passes
-from vslam.datasets.synthetic.render import Renderer, sensor_image
-from vslam.datasets.synthetic.routes import CAMERA_HEIGHT, Route, built_in_route
-from vslam.datasets.synthetic.scene import Surfaces, join
-from vslam.datasets.synthetic.site import Variation
-from vslam.datasets.synthetic.solids import box, turn
-from vslam.datasets.synthetic.town import Town, build_town
 from vslam.slam import Slam
 from vslam.types.camera import Camera, Image
 from vslam.types.features import TrackingState
 from vslam.types.geometry import inverse
+from vslam_lab.towns.passes import Passes
+from vslam_lab.towns.render import Renderer, sensor_image
+from vslam_lab.towns.routes import CAMERA_HEIGHT, Route, built_in_route
+from vslam_lab.towns.scene import Surfaces, join
+from vslam_lab.towns.site import Variation
+from vslam_lab.towns.solids import box, turn
+from vslam_lab.towns.town import Town, build_town
 
 STEP_S = 0.1
 FRAMES = 80

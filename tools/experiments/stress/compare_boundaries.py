@@ -18,7 +18,7 @@ from pathlib import Path
 from statistics import median
 
 from vslam.datasets.perturbation import LAWS
-from vslam.lab.stress.search import strength_at
+from vslam_lab.stress.search import strength_at
 
 Medians = dict[tuple[str, str], dict[str, float]]  # (sequence, system) -> law -> steps
 STEPS = 16  # strengths that four bisections distinguish

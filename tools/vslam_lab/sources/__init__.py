@@ -1,0 +1,1 @@
+"""Image sources for training and for comparing loop detectors."""

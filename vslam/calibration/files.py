@@ -6,6 +6,7 @@ The format of a file is recognised by its keys.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from vslam.calibration.documents import Document, read_document
@@ -18,6 +19,7 @@ from vslam.calibration.formats import (
     read_own,
     read_ros,
 )
+from vslam.calibration.imu import NOISE_KEYS, is_imu, read_imu
 from vslam.calibration.models import Calibration, CameraModel
 from vslam.support.errors import InputError, write_file
 
@@ -45,11 +47,13 @@ _FORMATS: tuple[tuple[set[str], _Reader, int], ...] = (
     ({"cameraMatrix1"}, read_opencv, 2),
 )
 _PAIRS = (  # file names in the order in which a folder is searched for them
-    ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml"),
-    ("cam0/sensor.yaml", "cam1/sensor.yaml"),
+    ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml", "mav0/imu0/sensor.yaml"),
+    ("cam0/sensor.yaml", "cam1/sensor.yaml", "imu0/sensor.yaml"),
     ("left.yaml", "right.yaml"),
     ("intrinsics.yml", "extrinsics.yml"),
+    ("camchain-imucam.yaml", "imu.yaml"),
     ("camchain.yaml",),
+    ("kalibr_imucam_chain.yaml", "kalibr_imu_chain.yaml"),
 )
 
 
@@ -57,7 +61,8 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
     """Read a calibration in any of the formats of docs/howto/cameras.md.
 
     Args:
-        files: one file, one file for each camera (left first), or a folder that contains them.
+        files: one file, one file for each camera (left first), or a folder that contains them. A
+            further file may describe the IMU (`vslam.calibration.imu`).
         size: width and height of the images, for files without an image size.
 
     Raises:
@@ -70,14 +75,22 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
         for found in (_in_folder(given) if given.is_dir() else [given])
     ]
     documents = [read_document(path) for path in paths]
+    imus = [document for document in documents if is_imu(document)]
+    documents = [document for document in documents if not is_imu(document)]
+    if not documents:
+        raise InputError(
+            f"--calib {imus[0].source}: describes an IMU and no camera; also give the calibration "
+            "of the camera."
+        )
     for keys, reader, most in _FORMATS:
         if any(keys <= document.values.keys() for document in documents):
             if len(documents) > most:
                 raise InputError(
-                    f"--calib {paths[most]}: is one file too many; this format has "
+                    f"--calib {documents[most].source}: is one file too many; this format has "
                     f"{'one file' if most == 1 else 'at most two files'}; leave the others out."
                 )
-            return reader(documents, size)
+            imu, noise = read_imu(documents, imus)
+            return replace(reader(documents, size), imu=imu, imu_noise=noise)
     there = ", ".join(" ".join(key.split())[:20] for key in sorted(documents[0].values)[:6])
     raise InputError(
         f"{paths[0]}: the format of this calibration is unknown (its keys are {there}); give "
@@ -87,7 +100,7 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Write the calibration of a camera or of a stereo pair in vslam's own format.
+    """Write the calibration of a camera or of a stereo pair, with its IMU, in vslam's own format.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -97,6 +110,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
         lines += ["right:", *_camera_lines(calibration.right)]
         lines += ["T_left_right:  # maps points of the right camera to the left one; metres"]
         lines += [f"  - {row}" for row in calibration.T_left_right.tolist()]
+    lines += _imu_lines(calibration)
     write_file(path, "\n".join(lines) + "\n", "give another file with --out")
 
 
@@ -108,6 +122,18 @@ def _camera_lines(model: CameraModel) -> list[str]:
         f"  centre: [{model.cx!r}, {model.cy!r}]",
         f"  distortion: {list(model.distortion)}",
     ]
+
+
+def _imu_lines(calibration: Calibration) -> list[str]:
+    imu, noise = calibration.imu, calibration.imu_noise
+    lines = []
+    if imu is not None:
+        lines += ["  T_imu_camera:  # maps points of the left camera to the IMU; metres"]
+        lines += [f"    - {row}" for row in imu.T_imu_camera.tolist()]
+        lines += [f"  time_offset: {imu.time_offset!r}  # seconds; time of the IMU - of the camera"]
+    if noise is not None:
+        lines += [f"  {key}: {getattr(noise, name)!r}" for name, key in NOISE_KEYS.items()]
+    return ["imu:", *lines] if lines else []
 
 
 def _in_folder(folder: Path) -> list[Path]:

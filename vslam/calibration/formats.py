@@ -40,7 +40,7 @@ _LENSES: dict[str, Lens] = {
 }
 _PAIR_KEYS = ("T_left_right", "baseline", "right_delay")
 _DEPTH_KEYS = ("depth_scale", "virtual_baseline")
-_OWN_KEYS = {"left", "right", *_PAIR_KEYS, *_DEPTH_KEYS}
+_OWN_KEYS = {"left", "right", "imu", *_PAIR_KEYS, *_DEPTH_KEYS}
 _OWN_CAMERA_KEYS = {"lens", "size", "focal", "centre", "distortion"}
 _ROUNDED = 1e-3  # tolerance for rotation matrices, whose numbers are rounded in files
 _LONGEST_DELAY_S = 0.1  # longest delay between the two images of a pair

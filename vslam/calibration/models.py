@@ -13,6 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.types.imu import ImuCalibration, ImuNoise
+
 Array = NDArray[np.float64]
 Lens = Literal["pinhole", "fisheye"]
 
@@ -63,6 +65,9 @@ class Calibration:
         virtual_baseline: baseline in metres that is used to convert depth to disparity; None if the
             file has none.
         right_delay: delay of the right image after the left image, in seconds.
+        imu: where the IMU is on the left camera before rectification, and how noisy it is; None if
+            the file does not tell where it is.
+        imu_noise: noise of the IMU; None if the file does not contain it.
         source: the file or files from which the calibration was read, for error messages.
     """
 
@@ -72,6 +77,8 @@ class Calibration:
     depth_scale: float | None = None
     virtual_baseline: float | None = None
     right_delay: float = 0.0
+    imu: ImuCalibration | None = field(default=None, compare=False)
+    imu_noise: ImuNoise | None = None
     source: str = field(default="the calibration", compare=False)
 
     def left_alone(self) -> Calibration:

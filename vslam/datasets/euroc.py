@@ -5,12 +5,15 @@ FOLDER/mav0/cam0/sensor.yaml               calibration of the left camera
 FOLDER/mav0/cam0/data/                     images of the left camera
 FOLDER/mav0/cam1/...                       the same for the right camera
 FOLDER/mav0/state_groundtruth_estimate0/   optional: ground truth of the body
+FOLDER/mav0/imu0/data.csv                  optional: inertial samples
+FOLDER/mav0/imu0/sensor.yaml               optional: pose and noise of the IMU
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence as Several
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +21,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
+from vslam.calibration.imu import read_imu
 from vslam.datasets.association import Pairing, pair_clocks, read_ground_truth
 from vslam.datasets.frames import RawSource, Source
 from vslam.datasets.image_files import (
@@ -27,6 +31,8 @@ from vslam.datasets.image_files import (
     select_frames,
     split_line,
 )
+from vslam.datasets.imu import Imu
+from vslam.datasets.imu_csv import read_imu_csv
 from vslam.datasets.rectified import rectified
 from vslam.datasets.times import (
     FIX_LIST,
@@ -80,9 +86,11 @@ def open_euroc(
     times = stamps.astype(np.float64) * 1e-9
     truth, warnings = _read_ground_truth(base, times)
     raw = checked_files("euroc", found, times, truth, files, None, pairing, timing)
+    imu, why_not = _imu(base)
+    raw = replace(raw, imu=imu)
     sensors = calib or [base / f"cam{side}" / "sensor.yaml" for side in range(len(files))]
     source = rectified(raw, read_calibration(sensors, raw.sizes[0]))
-    return replace(source, warnings=warnings)
+    return replace(source, warnings=(*warnings, *why_not))
 
 
 def open_raw_euroc(
@@ -188,6 +196,24 @@ def _pair(cameras: list[Path], times: list[NDArray[np.int64]]) -> NDArray[np.int
             "both cameras from one sequence, or run with --sensor mono."
         )
     return np.column_stack((pairs.first, pairs.second))
+
+
+def _imu(base: Path) -> tuple[Imu | None, tuple[str, ...]]:
+    """Return the IMU in ``base/imu0``, calibrated for the left camera before rectification, and a
+    warning if its calibration cannot be used."""
+    path = base / "imu0" / "data.csv"
+    if not path.is_file():
+        return None, ()
+    imu = Imu(str(path), partial(read_imu_csv, path))
+    files = [base / name / "sensor.yaml" for name in ("cam0", "imu0")]
+    if not all(file.is_file() for file in files):
+        return imu, ()
+    try:
+        camera, sensor = map(read_document, files)
+        calibration, noise = read_imu([camera], [sensor])
+    except InputError as error:
+        return imu, (f"The IMU is not used: {error}",)
+    return replace(imu, calibration=calibration, noise=noise), ()
 
 
 def _pairing(base: Path, times: list[NDArray[np.int64]], frames: NDArray[np.int64]) -> Pairing:

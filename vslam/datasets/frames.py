@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.association import Pairing
+from vslam.datasets.imu import Imu
 from vslam.datasets.times import Timing, in_order
 from vslam.support.errors import BrokenSourceError, InputError, UnreadableImageError
 from vslam.types.camera import Camera, DepthImage, Image, ImageMap
@@ -80,6 +81,7 @@ class _Frames:
     pairing: Pairing | None = None
     timing: Timing | None = None
     warnings: tuple[str, ...] = ()
+    imu: Imu | None = None
 
     def __post_init__(self) -> None:
         if not self.seekable:
@@ -159,6 +161,8 @@ class Source(_Frames):
             For a stream, only the frames that have been read so far are counted. None if all frames
             have their recorded times.
         warnings: what the report of a run must say about the data, in sentences.
+        imu: the IMU on the camera; None if there is none. Its calibration refers to the left camera
+            of ``camera``.
         rectify_mask: function that rectifies an ``(H, W)`` uint8 mask of the original left images.
             None if vslam does not rectify the images.
         world: name of the world frame of the ground truth, which all drives along a rendered route
@@ -183,6 +187,7 @@ class RawSource(_Frames):
             contains depth.
         depth: whether the second image contains the depth of the first image's pixels.
         ground_truth: poses of the left camera before rectification.
+        imu: its calibration refers to the left camera before rectification.
     """
 
     sizes: tuple[Size, ...]

@@ -15,6 +15,7 @@ from vslam.calibration.models import Calibration
 from vslam.calibration.rectification import Rectification, rectify
 from vslam.datasets.frames import Images, RawSource, Size, Source, TimedFrame, decoded
 from vslam.datasets.image_files import with_depth
+from vslam.datasets.imu import Imu
 from vslam.support.errors import InputError
 from vslam.types.camera import DepthImage, Image, ImageMap
 
@@ -53,7 +54,24 @@ def rectified(raw: RawSource, calibration: Calibration) -> Source:
         pairing=raw.pairing,
         timing=raw.timing,
         rectify_mask=rectification.left_depth,
+        imu=None if raw.imu is None else _rectified_imu(raw.imu, calibration, rectification),
     )
+
+
+def _rectified_imu(imu: Imu, calibration: Calibration, rectification: Rectification) -> Imu:
+    """Calibrate the IMU of a source for its rectified left camera.
+
+    What the calibration file says about the IMU replaces what the source says.
+    """
+    own = calibration.imu or imu.calibration
+    noise = calibration.imu_noise or imu.noise or (None if own is None else own.noise)
+    if own is None:
+        return replace(imu, noise=noise)
+    T_left_rectified = np.eye(4)
+    T_left_rectified[:3, :3] = rectification.R_left_rectified
+    T_imu_camera = own.T_imu_camera @ T_left_rectified
+    one = replace(own, T_imu_camera=T_imu_camera, noise=noise or own.noise)
+    return replace(imu, calibration=one, noise=noise)
 
 
 def _rectification_for(calibration: Calibration, sizes: Several[Size]) -> Rectification:

@@ -1,0 +1,101 @@
+"""The IMU of a source of frames: its samples, and where it is on the camera.
+
+`vslam.types.imu` defines samples and calibration. Readers deliver samples with times of the IMU's
+own clock. `ImuFeed` passes them to a run, in times of the camera's clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from vslam.types.geometry import Matrix
+from vslam.types.imu import (
+    ImuCalibration,
+    ImuNoise,
+    TidySamples,
+    in_camera_time,
+    no_samples,
+    tidied,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Imu:
+    """The IMU of a source.
+
+    Attributes:
+        name: file, topic or device, for messages.
+        read: function that returns ``(N, 7)`` float64 samples with times of the IMU's clock. Of a
+            recording, it returns all samples. Of a live device, it returns the samples that have
+            arrived since the last call, without waiting. It raises InputError if a file is
+            malformed.
+        calibration: where the IMU is on the left camera; None if this is unknown, so that a run
+            cannot use the samples.
+        noise: noise that a file states, even if ``calibration`` is None; None if no file does.
+        live: whether samples arrive in real time.
+    """
+
+    name: str
+    read: Callable[[], Matrix]
+    calibration: ImuCalibration | None = None
+    noise: ImuNoise | None = None
+    live: bool = False
+
+    @cached_property
+    def recorded(self) -> TidySamples:
+        """All samples of a recording in the order of their times, with times of the IMU's clock.
+
+        Raises:
+            InputError: the samples cannot be read.
+            TypeError: the IMU is live.
+        """
+        if self.live:
+            raise TypeError(f"{self.name}: the samples of a live device can only be read in order")
+        return tidied(self.read())
+
+
+class ImuFeed:
+    """Passes the samples of an IMU to a run, frame by frame."""
+
+    def __init__(self, imu: Imu) -> None:
+        """
+        Raises:
+            ValueError: the IMU has no calibration.
+            InputError: the samples of a recording cannot be read.
+        """
+        if imu.calibration is None:
+            raise ValueError(f"{imu.name}: the place of the IMU on the camera is unknown")
+        self._imu, self._offset = imu, imu.calibration.time_offset
+        recorded = no_samples() if imu.live else imu.recorded.samples
+        self._waiting = in_camera_time(recorded, self._offset)
+        self._passed = 0
+
+    def until(self, timestamp: float) -> Matrix:
+        """Return the samples that come after those of the last call, up to the first one that is
+        not before ``timestamp``.
+
+        That sample is needed to interpolate the rates at the time of the frame. The first call also
+        returns all samples before the first frame.
+
+        Args:
+            timestamp: time of a frame in seconds of the camera's clock, not before that of the last
+                call.
+
+        Returns:
+            ``(M, 7)`` float64 samples with times of the camera's clock. Those of a live device are
+            in the order of their arrival, and end before ``timestamp`` if later ones have not
+            arrived.
+        """
+        if self._imu.live:
+            arrived = in_camera_time(self._imu.read(), self._offset)
+            self._waiting = np.concatenate([self._waiting[self._passed :], arrived])
+            self._passed = 0
+            end = len(self._waiting)
+        else:
+            end = int(np.searchsorted(self._waiting[:, 0], timestamp)) + 1
+        begin, self._passed = self._passed, max(self._passed, min(end, len(self._waiting)))
+        return self._waiting[begin : self._passed]

@@ -69,12 +69,6 @@ ALWAYS = (
 )
 RULES = {
     "README.md": Rules(
-        (
-            (
-                "vslam bench    #",
-                f"vslam bench --seqs 00 --seeds 1 --perturb none --max-frames {N} #",
-            ),
-        ),
         not_run=(
             ("git clone", "it needs the address of the repository"),
             ("make ", "CI runs it, and this test in it"),

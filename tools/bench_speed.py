@@ -1,7 +1,7 @@
 """Measure the speed of vslam and ORB-SLAM3 (pyorbslam3) and write the results as Markdown.
 
     python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" [--also="--detector both"] \
-        [--repeats 3] [--write docs/research/performance.md] [--csv docs/research/performance.csv] \
+        [--repeats 3] [--write PAGE.md] [--csv docs/research/performance.csv] \
         [--orbslam3-python PY --vocabulary voc.txt]
 
 A case is a folder in KITTI's format, a sequence in it and a number of frames. The two systems run

@@ -109,6 +109,7 @@ def write_bag(
     lag: int = 0,
     padding: int = 0,
     compression: str = "",
+    imu: dict[str, np.ndarray] | None = None,
 ) -> Path:
     """Write a bag with one topic for each side, and return the path to open.
 
@@ -123,6 +124,7 @@ def write_bag(
         calibrated: whether the camera_info is calibrated. Otherwise, it is all zero.
         lag: delay of the timestamps of the second side in nanoseconds.
         padding: number of bytes after each row.
+        imu: ``(N, 7)`` inertial samples of each topic.
         compression: ``bz2`` or ``lz4`` for ROS 1; ``file``, ``message`` or ``storage`` for ROS 2.
     """
     from rosbags.rosbag1 import Writer as Writer1
@@ -144,6 +146,10 @@ def write_bag(
         for package in reversed(wanted)
         for name, made in store.types.items()
         if name.startswith(package)
+    }
+
+    geometry = {
+        name: store.types[f"geometry_msgs/msg/{name}"] for name in ("Quaternion", "Vector3")
     }
 
     def header(stamp: int):
@@ -192,6 +198,17 @@ def write_bag(
             for number, (connection, image, image_type) in enumerate(kinds):
                 made = message(image, stamp + number * lag)
                 writer.write(connection, stamp + number, serialize(made, image_type))
+        imu_type = "sensor_msgs/msg/Imu"
+        for topic, rows in (imu or {}).items():
+            connection = writer.add_connection(topic, imu_type, typestore=store)
+            for row in rows:
+                stamp = round(1e9 * row[0])
+                made = types["Imu"](
+                    header(stamp), geometry["Quaternion"](0.0, 0.0, 0.0, 1.0), np.zeros(9),
+                    geometry["Vector3"](*row[1:4]), np.zeros(9),
+                    geometry["Vector3"](*row[4:]), np.zeros(9),
+                )  # fmt: skip
+                writer.write(connection, stamp, serialize(made, imu_type))
     return next(path.glob("*.mcap")) if kind == "mcap" else path
 
 

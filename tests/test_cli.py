@@ -343,7 +343,7 @@ def test_help_is_grouped_and_short(call, monkeypatch):
     assert re.findall(r"^╭─ (\w+) ", out, re.M) == [
         "Input", "Method", "Map", "Execution", "Output",
     ]  # fmt: skip
-    assert len(out.splitlines()) <= 110
+    assert len(out.splitlines()) <= 115
     assert "<" not in out + call("--help")[1] + call("map", "--help")[1]  # types
     assert "│ --map FILE|FOLDER " in out
     assert "First frame. [default: 0]" in out

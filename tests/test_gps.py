@@ -161,7 +161,7 @@ BAD = {
     "longitude": (refused(f"{HEAD}\n1,9,200,4\n"), "from -180 to 180"),
     "other times": (refused(f"{HEAD}\n1e9,48,11,5\n"), "the images are from 0.000 to"),
     "no packets": (lambda folder: folder, "no data/*.txt"),
-    "unequal": (lambda folder: oxts(folder / "oxts", times=2), "2 times for 3 fixes"),
+    "unequal": (lambda folder: oxts(folder / "oxts", times=2), "2 times for 3 packets"),
     "no stamps": (lambda folder: oxts(folder / "oxts", times=0), "the file is empty"),
     "no topic": (lambda folder: bag_of(folder / "a.bag", [], topics=()), "the bag has none"),
     "two topics": (

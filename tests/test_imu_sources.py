@@ -7,11 +7,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from source_files import write_bag, write_video
 from test_euroc import numbers, sensor
+from test_kitti_raw import DRIVE, FIRST, T_X, line, write_drive
 
+from vslam.datasets.bag_imu import joined
 from vslam.datasets.euroc import open_euroc
 from vslam.datasets.imu import Imu, ImuFeed
 from vslam.datasets.imu_csv import HEADER, read_imu_csv
+from vslam.datasets.sources import SourceOptions, open_source
 from vslam.support.errors import InputError
 from vslam.types.geometry import se3_exp
 from vslam.types.imu import GRAVITY, ImuCalibration
@@ -195,3 +199,150 @@ def test_rectification_turns_the_calibration_of_the_imu(corridor, tmp_path):
     assert source.imu.calibration is None
     assert "all zeros" in source.warnings[0]
     assert "The IMU is not used" in source.warnings[0]
+
+
+def bag(tmp_path: Path, corridor, kind: str, **topics: np.ndarray) -> dict:
+    sides = {"/left/image": corridor.left[:2], "/right/image": corridor.right[:2]}
+    path = tmp_path / {"ros1": "drive.bag"}.get(kind, "drive")
+    named = {f"/imu/{name}": rows for name, rows in topics.items()}
+    stamps = [10**10, 10**10 + 10**8]
+    found = write_bag(path, kind, sides, stamps, camera=corridor.camera, imu=named)
+    return {"data": str(found), "dataset": "bag", "topics": "/left/image,/right/image"}
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros2", "mcap"])
+def test_the_only_imu_of_a_bag_is_read(tmp_path, corridor, kind):
+    given = bag(tmp_path, corridor, kind, data=samples())
+    imu = open_source(SourceOptions(**given)).imu
+    assert imu is not None
+    assert imu.name.endswith(": /imu/data")
+    assert imu.calibration is None
+    np.testing.assert_allclose(imu.recorded.samples, samples(), atol=1e-9)
+    assert open_source(SourceOptions(**given, imu=False)).imu is None
+
+
+def test_gyroscope_and_accelerometer_in_two_topics_are_joined(tmp_path, corridor):
+    """As RealSense records them: 200 and 100 Hz, each with zeros in place of the other."""
+    rows = samples(40)
+    rows[:, 4] = 3.0 * (rows[:, 0] - 10.0)  # so that interpolation is exact
+    gyro, accel = rows.copy(), rows[1::2].copy()
+    gyro[:, 4:], accel[:, 1:4] = 0.0, 0.0
+    given = bag(tmp_path, corridor, "ros1", gyro=gyro, accel=accel)
+    imu = open_source(SourceOptions(**given)).imu
+    assert imu is not None
+    np.testing.assert_allclose(imu.recorded.samples, rows[1:], atol=1e-8)
+
+
+def test_samples_in_a_gap_of_the_accelerometer_are_left_out():
+    gyro, accel = samples(100), samples(100)
+    accel = np.delete(accel, slice(40, 70), axis=0)  # 0.155 s
+    assert len(joined(gyro, accel)) == 100 - 30
+    assert joined(gyro, accel[:1]).shape == (0, 7)
+
+
+def test_the_user_chooses_among_several_imus(tmp_path, corridor):
+    given = bag(tmp_path, corridor, "ros1", body=samples(), camera=samples(20))
+    source = open_source(SourceOptions(**given))
+    assert source.imu is None
+    assert "/imu/body, /imu/camera" in source.warnings[0]
+    imu = open_source(SourceOptions(**given, imu_topics="/imu/camera")).imu
+    assert imu is not None
+    assert len(imu.recorded.samples) == 20
+    with pytest.raises(InputError, match=r"--imu-topics /imu: not in .*/imu/body, /imu/camera"):
+        open_source(SourceOptions(**given, imu_topics="/imu"))
+
+
+def test_samples_without_time_stamps_are_refused(tmp_path, corridor):
+    rows = samples()
+    rows[:, 0] = 0.0
+    imu = open_source(SourceOptions(**bag(tmp_path, corridor, "ros1", data=rows))).imu
+    assert imu is not None
+    with pytest.raises(InputError, match="no time stamps"):
+        imu.recorded  # noqa: B018
+
+
+T_IMU_CAMERA = se3_exp(np.array([0.05, 0.0, 0.02, 0.1, 0.2, 0.3]))
+
+
+def calibration(tmp_path: Path, camera) -> Path:
+    path = tmp_path / "rig.yaml"
+    path.write_text(
+        f"left:\n  focal: [{camera.fx}, {camera.fy}]\n  centre: [{camera.cx}, {camera.cy}]\n"
+        f"imu:\n  T_imu_camera: {T_IMU_CAMERA.tolist()}\n"
+    )
+    return path
+
+
+@pytest.mark.parametrize("name", ["images/imu.csv", "imu.csv", "drive.imu.csv"])
+def test_a_csv_file_beside_images_or_a_video(tmp_path, corridor, name):
+    (tmp_path / "images").mkdir()
+    for k in range(2):
+        cv2.imwrite(str(tmp_path / f"images/{10**10 + k * 10**8}.png"), corridor.left[k])
+    write_video(tmp_path / "drive.avi", corridor.left[:5], 10.0)
+    write(tmp_path / name, HEADER, samples())
+    calib = calibration(tmp_path, corridor.camera)
+    for data, expected in (
+        ("images", name != "drive.imu.csv"),
+        ("drive.avi", "images" not in name),
+    ):
+        given = SourceOptions(data=str(tmp_path / data), calib=(calib,), sensor="mono")
+        imu = open_source(given).imu
+        assert (imu is not None) is expected
+        if imu is not None:
+            assert imu.calibration is not None
+            np.testing.assert_allclose(imu.calibration.T_imu_camera, T_IMU_CAMERA, atol=1e-12)
+            np.testing.assert_allclose(imu.recorded.samples, samples())
+
+
+def oxts(drive: Path, rate: int) -> None:
+    folder = drive / "oxts"
+    (folder / "data").mkdir(parents=True)
+    stamps = [f"2011-09-26 13:02:25.{250000123 + k * 10**9 // rate:09d}" for k in range(20)]
+    (folder / "timestamps.txt").write_text("\n".join(stamps) + "\n")
+    for k in range(20):
+        numbers = np.zeros(30)
+        numbers[11:14], numbers[17:20] = (0.1, 0.2, GRAVITY), (0.01, 0.02, 0.03 + k)
+        text = " ".join(map(repr, numbers.tolist()))
+        (folder / "data" / f"{k:010}.txt").write_text(text)
+
+
+def test_the_inertial_unit_of_kitti_raw(tmp_path):
+    """Axes of unit and laser: ahead, left, up. Axes of the camera: right, down, ahead."""
+    drive = write_drive(tmp_path)
+    oxts(drive, 40)
+    source = open_source(SourceOptions(data=str(drive)))
+    assert source.imu is not None
+    assert source.imu.calibration is None
+    (drive.parent / "calib_imu_to_velo.txt").write_text(
+        line("R", np.eye(3)) + line("T", [-0.81, 0.32, -0.8])
+    )
+    (drive.parent / "calib_velo_to_cam.txt").write_text(
+        "calib_time: 15-Mar-2012 11:37:16\nR: 0 -1 0 0 0 -1 1 0 0\nT: 0 -0.08 -0.27\n"
+    )
+    for kind in ("stereo", "mono"):
+        imu = open_source(SourceOptions(data=str(drive), sensor=kind)).imu
+        assert imu is not None
+        assert imu.calibration is not None
+        T_camera_imu = np.linalg.inv(imu.calibration.T_imu_camera)
+        np.testing.assert_allclose(T_camera_imu[:3, :3] @ (0, 0, 1), (0, -1, 0), atol=1e-12)
+        place = (-0.32, 0.8 - 0.08, -0.81 - 0.27)
+        np.testing.assert_allclose(T_camera_imu[:3, 3], place, atol=1e-9)
+    found = imu.recorded.samples
+    np.testing.assert_allclose(found[:, 0], FIRST + np.arange(20) / 40, atol=2e-6)
+    np.testing.assert_allclose(found[3, 1:], [0.01, 0.02, 3.03, 0.1, 0.2, GRAVITY])
+    oxts(drive.with_name(DRIVE.replace("sync", "extract")), 100)
+    faster = open_source(SourceOptions(data=str(drive))).imu
+    assert faster is not None
+    assert np.diff(faster.recorded.samples[:2, 0]) == pytest.approx(0.01, abs=1e-5)
+
+
+def test_another_colour_camera_of_kitti_raw_is_beside_the_first(tmp_path):
+    drive = write_drive(tmp_path, cameras=(2, 3))
+    oxts(drive, 100)
+    for name in ("calib_imu_to_velo.txt", "calib_velo_to_cam.txt"):
+        (drive.parent / name).write_text(line("R", np.eye(3)) + line("T", [0.1, 0.0, 0.0]))
+    imu = open_source(SourceOptions(data=str(drive))).imu
+    assert imu is not None
+    assert imu.calibration is not None
+    place = np.linalg.inv(imu.calibration.T_imu_camera)[:3, 3]
+    np.testing.assert_allclose(place, [0.2 + T_X[2], 0, 0], atol=1e-9)

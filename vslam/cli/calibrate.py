@@ -34,7 +34,7 @@ app = typer.Typer()
 
 
 @app.command(epilog=_EXAMPLES)
-@reads_source(without=("calib", "depth", "depth_scale", "mask"))
+@reads_source(without=("calib", "depth", "depth_scale", "mask", "imu", "imu_topics"))
 def calibrate(
     given: SourceOptions,
     board: Annotated[

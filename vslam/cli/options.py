@@ -245,6 +245,16 @@ def _source_options(
             "RGB-D.",
         ),
     ] = "",
+    imu_topics: Annotated[
+        str,
+        option(
+            INPUT,
+            "TOPIC",
+            "IMU topic of a bag, or GYRO,ACCEL.",
+            unset=False,
+        ),
+    ] = "",
+    imu: Annotated[bool, flag(INPUT, "Whether to use the IMU.", "--imu/--no-imu")] = True,
     depth_scale: Annotated[
         float | None,
         option(
@@ -290,7 +300,8 @@ def _source_options(
         raise InputError(f"--dataset {dataset}: give the data with --data.")
     return SourceOptions(
         data=data or "", dataset=dataset, seq=seq, calib=tuple(calib or ()), right=right,
-        depth=depth, fps=fps, side_by_side=side_by_side, topics=topics, depth_scale=depth_scale,
+        depth=depth, fps=fps, side_by_side=side_by_side, topics=topics,
+        imu_topics=imu_topics, imu=imu, depth_scale=depth_scale,
         sensor=sensor, mask=mask, start=start, every=every, max_frames=max_frames,
     )  # fmt: skip
 

@@ -26,7 +26,7 @@ app = typer.Typer()
 
 
 @app.command("perturb", epilog=_EXAMPLE)
-@reads_source(without=("mask",))
+@reads_source(without=("mask", "imu", "imu_topics"))
 def preview(
     given: SourceOptions,
     perturb: Perturb = "brightness",

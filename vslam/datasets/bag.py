@@ -26,6 +26,7 @@ from vslam.calibration.formats import read_ros
 from vslam.calibration.models import Calibration
 from vslam.datasets.association import DEPTH_NEAR_S, Pairing
 from vslam.datasets.bag_files import Recording, first_message, messages, opened
+from vslam.datasets.bag_imu import find_imu
 from vslam.datasets.bag_messages import (
     FIX_TYPE,
     IMAGE_TYPES,
@@ -80,6 +81,7 @@ def open_bag(
     topics: tuple[str, ...] = (),
     sensor: str | None = None,
     depth_scale: float | None = None,
+    imu_topics: tuple[str, ...] = (),
 ) -> BagSource:
     """Open a bag and read its first frame.
 
@@ -94,6 +96,7 @@ def open_bag(
             is None, the sensor is derived from the content of the topics.
         depth_scale: depth image units per metre. None takes what librealsense recorded or, without
             it, derives it from the encoding.
+        imu_topics: see `vslam.datasets.bag_imu.find_imu`.
 
     Raises:
         InputError: a library is not installed, the bag is missing or truncated, topics are missing,
@@ -139,6 +142,7 @@ def open_bag(
         if depth:
             _check_registered(path, recording, chosen, [image.shape for image in images])
         sizes = tuple((image.shape[1], image.shape[0]) for image in images)
+        imu, warnings = find_imu(path, recording, imu_topics)
         return BagSource(
             dataset="bag",
             name=path.stem,
@@ -149,6 +153,8 @@ def open_bag(
             n_expected=_estimated_frames(recording, chosen),
             depth=depth,
             pairing=pairing if len(chosen) == 2 else None,
+            imu=imu,
+            warnings=warnings,
         )
 
 

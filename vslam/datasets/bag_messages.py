@@ -42,7 +42,8 @@ CAMERA_INFO_TYPES = frozenset(
 FIX_TYPE = "sensor_msgs/msg/NavSatFix"
 TRANSFORM_TYPE = "geometry_msgs/msg/Transform"
 NUMBER_TYPE = "std_msgs/msg/Float32"
-READ_TYPES = IMAGE_TYPES | CAMERA_INFO_TYPES | {FIX_TYPE, TRANSFORM_TYPE, NUMBER_TYPE}
+IMU_TYPE = "sensor_msgs/msg/Imu"
+READ_TYPES = IMAGE_TYPES | CAMERA_INFO_TYPES | {FIX_TYPE, IMU_TYPE, TRANSFORM_TYPE, NUMBER_TYPE}
 # The number of channels, and the name of the colour space in OpenCV's constants.
 _ENCODINGS: dict[str, tuple[int, str | None]] = {
     "mono": (1, None),
@@ -138,6 +139,12 @@ def nav_sat_fix(message: Message) -> tuple[float, ...]:
     known = message.position_covariance_type > 0 and (variances > 0.0).all()
     sigma = np.sqrt(variances) if known else np.full(3, np.nan)
     return (stamp_of(message) / 10**9, *map(float, position), *sigma.tolist())
+
+
+def inertial_sample(message: Message) -> tuple[float, ...]:
+    """Convert an ``Imu`` to time (s), angular rate xyz (rad/s) and specific force xyz (m/s^2)."""
+    rate, force = message.angular_velocity, message.linear_acceleration
+    return stamp_of(message) / 10**9, rate.x, rate.y, rate.z, force.x, force.y, force.z
 
 
 def grey_of(message: Message, levels: Levels | None = None) -> Image:

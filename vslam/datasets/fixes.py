@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from vslam.datasets.bag import read_fixes_of_bag
 from vslam.datasets.detection import is_bag
 from vslam.datasets.frames import Source
-from vslam.datasets.times import read_times
+from vslam.datasets.kitti_imu import read_oxts
 from vslam.support.errors import InputError
 from vslam.support.file_kinds import read_text
-from vslam.types.trajectory import read_table
 
 # Standard deviation for receivers that do not state one. It is typical under an open sky.
 DEFAULT_SIGMA_M = 2.0
@@ -35,7 +34,7 @@ _NAMES = {
     "sigma": ("sigma",),
 }
 _SINCE_1970_S = 1e8  # smaller times are counted from another moment
-_OXTS_COLUMNS, _POS_ACCURACY = 30, 23  # numbers in an OXTS packet, and the index of pos_accuracy
+_POS_ACCURACY = 23  # index of pos_accuracy in an OXTS packet
 
 
 @dataclass(frozen=True)
@@ -227,16 +226,7 @@ def _read_oxts(folder: Path) -> NDArray[np.float64]:
 
     The times are in seconds since 1970.
     """
-    files = sorted((folder / "data").glob("*.txt"))
-    if not files:
-        raise InputError(f"--gps {folder}: no data/*.txt; give the folder oxts of KITTI raw.")
-    path = folder / "timestamps.txt"
-    times = read_times(path)
-    if len(times) != len(files):
-        raise InputError(
-            f"--gps {path}: {len(times)} times for {len(files)} fixes; take both from one drive."
-        )
-    rows = np.array([read_table(file, (_OXTS_COLUMNS,), "an OXTS packet", 1)[0] for file in files])
+    times, rows = read_oxts(folder, "--gps")
     sigma = np.repeat(rows[:, [_POS_ACCURACY]], 3, axis=1)
     return np.column_stack([times, rows[:, :3], sigma])
 

@@ -5,6 +5,7 @@ DATE/DRIVE/image_00/data/0000000000.png       images of the left grey camera
 DATE/DRIVE/image_00/timestamps.txt            their dates and times
 DATE/DRIVE/image_01/...                       the same for the right grey camera
 DATE/DRIVE/image_02/..., image_03/...         the same for the colour cameras
+DATE/DRIVE/oxts/...                           inertial unit, see `vslam.datasets.kitti_imu`
 
 The names of synchronised drives end in ``_sync``, and their images are rectified. The names of
 unsynchronised drives end in ``_extract``. Their images are rectified when they are read.
@@ -13,6 +14,7 @@ unsynchronised drives end in ``_extract``. Their images are rectified when they 
 from __future__ import annotations
 
 from collections.abc import Sequence as Several
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +23,10 @@ from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
 from vslam.calibration.formats import Size, read_kitti_raw
 from vslam.calibration.models import Calibration
-from vslam.datasets.frames import Source
+from vslam.datasets.frames import RawSource, Source
 from vslam.datasets.image_files import checked_files, find_sequence, select_frames
 from vslam.datasets.kitti import files_of_frames, find_cameras, row_numbers
+from vslam.datasets.kitti_imu import imu_of_drive
 from vslam.datasets.rectified import rectified
 from vslam.datasets.times import FIX_LIST, ordered_list, times_of_list
 from vslam.support.errors import InputError
@@ -80,7 +83,23 @@ def open_kitti_raw(
     sides = files_of_frames(places, listed, [stems[k] for k in kept[selected]])
     name = folder.resolve().name
     images = checked_files("kitti_raw", name, np.array(times)[selected], None, sides, timing=timing)
-    return rectified(images, _calibration(folder, calib, images.sizes[0], cameras))
+    images, warnings = _with_imu(images, folder, cameras[0])
+    source = rectified(images, _calibration(folder, calib, images.sizes[0], cameras))
+    return replace(source, warnings=warnings)
+
+
+def _with_imu(images: RawSource, folder: Path, camera: int) -> tuple[RawSource, tuple[str, ...]]:
+    """Add the inertial unit of the drive. A warning says why its calibration cannot be used."""
+    drive = folder.resolve()
+    files = (path / _CALIBRATION for path in (drive.parent, drive))
+    file = next((file for file in files if file.is_file()), None)
+    if file is None:
+        return images, ()
+    try:
+        imu = imu_of_drive(drive, read_document(file), images.sizes[0], camera)
+    except InputError as error:
+        return images, (f"The IMU is not used: {error}",)
+    return replace(images, imu=imu), ()
 
 
 def is_kitti_raw(folder: Path) -> bool:

@@ -53,6 +53,7 @@ def rectified(raw: RawSource, calibration: Calibration) -> Source:
         ground_truth=T_wc,
         pairing=raw.pairing,
         timing=raw.timing,
+        warnings=raw.warnings,
         rectify_mask=rectification.left_depth,
         imu=None if raw.imu is None else _rectified_imu(raw.imu, calibration, rectification),
     )

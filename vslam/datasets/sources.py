@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from vslam.datasets import open_sequence
 from vslam.datasets.detection import detect_dataset
 from vslam.datasets.frames import RawSource, Source, selected
 from vslam.datasets.image_files import depth_scale_of, list_images
+from vslam.datasets.imu import Imu
+from vslam.datasets.imu_csv import read_imu_csv
 from vslam.datasets.kitti_raw import is_kitti_raw
 from vslam.datasets.masks import with_masks
 from vslam.datasets.rectified import rectified
@@ -41,6 +44,9 @@ class SourceOptions(BaseModel):
         side_by_side: whether each frame contains the left and the right image side by side.
         topics: for a bag, the topic of the left images, or two topics separated by a comma. The
             second topic contains the right images or the depth images.
+        imu_topics: for a bag, the topic of the IMU, or those of its gyroscope and accelerometer,
+            separated by a comma.
+        imu: whether to use the IMU of the source.
         depth_scale: depth image units per metre.
         sensor: ``stereo``, ``rgbd`` or ``mono``. With ``mono``, only the left images are read. None
             reads all images of the source.
@@ -61,6 +67,8 @@ class SourceOptions(BaseModel):
     fps: float | None = None
     side_by_side: bool = False
     topics: str = ""
+    imu_topics: str = ""
+    imu: bool = True
     depth_scale: float | None = None
     sensor: str | None = None
     mask: Path | None = None
@@ -75,8 +83,10 @@ _APPLIES_TO = {
     "fps": ("images", "video"),
     "side_by_side": ("video", "camera"),
     "topics": ("bag",),
+    "imu_topics": ("bag",),
     "depth_scale": ("tum", "images", "bag"),
 }
+_IMU_FILE = "imu.csv"
 _NOT_MONOCULAR = ("right", "depth", "depth_scale")
 
 
@@ -111,6 +121,8 @@ def open_source(
             f"--sensor {o.sensor}: {source.name} has the sensor {source.camera.sensor}; leave the "
             "option out, or use mono."
         )
+    if not o.imu:
+        source = replace(source, imu=None)
     if o.mask is None:
         return source
     return with_masks(source, o.mask, start=o.start, every=o.every)
@@ -128,7 +140,7 @@ def _open_images(dataset: str, options: SourceOptions) -> Source:
         )  # fmt: skip
         calibration = _calibration(dataset, o, found.size)
         scale = depth_scale_of(o.depth_scale, calibration.depth_scale)
-        return rectified(found.source(scale), calibration)
+        return rectified(replace(found.source(scale), imu=_imu_beside(Path(o.data))), calibration)
     raw, own = _open_stream(dataset, o, monocular)
     return rectified(raw, _calibration(dataset, o, raw.sizes[0], own))
 
@@ -185,13 +197,14 @@ def _open_stream(
         from vslam.datasets.video import open_video
 
         raw = open_video(Path(o.data), fps=o.fps, side_by_side=o.side_by_side, monocular=monocular)
+        raw = replace(raw, imu=_imu_beside(Path(o.data)))
     elif dataset == "bag":
         from vslam.datasets.bag import find_calibration, open_bag
 
-        topics = tuple(name.strip() for name in o.topics.split(",") if name.strip())
         raw = bag = open_bag(
-            Path(o.data), topics=topics, sensor=o.sensor, depth_scale=o.depth_scale
-        )
+            Path(o.data), topics=_names(o.topics), sensor=o.sensor, depth_scale=o.depth_scale,
+            imu_topics=_names(o.imu_topics),
+        )  # fmt: skip
         own = partial(find_calibration, bag)
     elif dataset in DEPTH_CAMERAS:
         from vslam.datasets.depth_cameras import frames_of
@@ -206,6 +219,21 @@ def _open_stream(
 
         raw = open_camera(o.data, side_by_side=o.side_by_side, monocular=monocular)
     return selected(raw, start=o.start, every=o.every, max_frames=o.max_frames), own
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _imu_beside(data: Path) -> Imu | None:
+    """Return the IMU whose samples are in a CSV file beside a video, or in or beside a folder.
+
+    For ``drive.mp4``, the file is ``drive.imu.csv`` or ``imu.csv``.
+    """
+    named = [data.with_suffix(".imu.csv")] if data.is_file() else [data / _IMU_FILE]
+    files = [*named, data.resolve().parent / _IMU_FILE]
+    file = next((file for file in files if file.is_file()), None)
+    return None if file is None else Imu(str(file), partial(read_imu_csv, file))
 
 
 def _check_options(dataset: str, options: SourceOptions) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from vslam.config import Config
 from vslam.loopclosure.detector import LoopDetector, NoDetector
+from vslam.loopclosure.names import DETECTORS
 from vslam.loopclosure.plugin_detector import PlugInDetector, open_plugin
 from vslam.loopclosure.siamese.weights import NETWORKS, TO_THE_LETTER, find_weights
 from vslam.support import plugins
@@ -17,8 +18,6 @@ from vslam.support.errors import InputError, did_you_mean
 if TYPE_CHECKING:
     from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 
-DETECTORS = ("none", "bow", "both", *NETWORKS)
-DEFAULT_DETECTOR = "both"
 _ABOUT = {
     "none": "no loop closing",
     "bow": "the bag of words",

@@ -10,12 +10,13 @@ import numpy as np
 
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.datasets.sources import SourceOptions, open_source
+from vslam.datasets.sources import open_source
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
 from vslam.types.camera import Camera
+from vslam.types.source_options import SourceOptions
 
 NO_OPTIONS = SourceOptions()
 LEFT, RIGHT = "/cam0/image_raw", "/cam1/image_raw"

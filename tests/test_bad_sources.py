@@ -26,8 +26,8 @@ from source_files import (
 
 from vslam.datasets import video
 from vslam.datasets.frames import selected
-from vslam.datasets.sources import SourceOptions
 from vslam.support.errors import InputError
+from vslam.types.source_options import SourceOptions
 
 FRAMES = 12
 

@@ -17,8 +17,9 @@ from vslam.calibration.formats import read_ros
 from vslam.datasets.bag import open_bag
 from vslam.datasets.bag_messages import camera_info, depth_in
 from vslam.datasets.bag_topics import camera_info_of
-from vslam.datasets.sources import SourceOptions, open_raw
+from vslam.datasets.sources import open_raw
 from vslam.support.errors import InputError
+from vslam.types.source_options import SourceOptions
 
 WIDTH, HEIGHT = 64, 48
 FOCAL, CENTRE = 50.0, (31.0, 24.0)

@@ -24,7 +24,7 @@ from vslam.cli import options
 from vslam.cli import run as run_command
 from vslam.config import PRESETS, as_config, changed_thresholds, thresholds_in_words
 from vslam.datasets import open_sequence, png
-from vslam.loopclosure.registry import DETECTORS
+from vslam.loopclosure.names import DETECTORS
 from vslam.loopclosure.siamese.weights import NETWORKS
 from vslam.report import figures
 from vslam.report.folder import write_results

@@ -42,8 +42,15 @@ LEVELS: tuple[tuple[str, ...], ...] = (
         "vslam.support.untrusted",
         "vslam.support.lock_file",
         "vslam.support.file_kinds",
+        "vslam.support.options",
     ),
-    ("vslam.config", "vslam.types.geometry", "vslam.support.ransac", "vslam.types.camera"),
+    (
+        "vslam.config",
+        "vslam.types.geometry",
+        "vslam.support.ransac",
+        "vslam.types.camera",
+        "vslam.types.source_options",
+    ),
     ("vslam.types.odometry", "vslam.types.context", "vslam.types.imu"),
     ("vslam.types.features",),
     (

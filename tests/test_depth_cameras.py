@@ -15,8 +15,8 @@ from conftest import corridor_depth
 from source_files import open_from, run_source, write_calibration
 
 from vslam.datasets import depth_cameras
-from vslam.datasets.sources import SourceOptions
 from vslam.support.errors import BrokenSourceError, InputError
+from vslam.types.source_options import SourceOptions
 
 FRAMES = 8
 PACKAGES = {"realsense": "pyrealsense2", "oakd": "depthai"}

@@ -17,9 +17,9 @@ from source_files import open_from, run_source, write_bag, write_calibration, wr
 from vslam.datasets.association import Pairing
 from vslam.datasets.bag import _synchronised
 from vslam.datasets.detection import detect_dataset
-from vslam.datasets.sources import SourceOptions
 from vslam.support.errors import InputError
 from vslam.types.camera import Camera
+from vslam.types.source_options import SourceOptions
 
 FRAMES = 8
 COLOUR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"

@@ -12,7 +12,8 @@ from source_files import LEFT, RIGHT, open_from, write_bag, write_calibration, w
 from vslam.datasets.bag_messages import grey_of, levels_of_messages
 from vslam.datasets.grey_levels import levels_of, upper_bits
 from vslam.datasets.image_files import read_grey
-from vslam.datasets.sources import SourceOptions, open_raw
+from vslam.datasets.sources import open_raw
+from vslam.types.source_options import SourceOptions
 
 N = 10
 

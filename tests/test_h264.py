@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from source_files import open_from, run_source, write_calibration
 
-from vslam.datasets.sources import SourceOptions
 from vslam.support.errors import InputError
+from vslam.types.source_options import SourceOptions
 
 av = pytest.importorskip("av")
 

@@ -15,10 +15,11 @@ from vslam.datasets.bag_imu import joined
 from vslam.datasets.euroc import open_euroc
 from vslam.datasets.imu import Imu, ImuFeed
 from vslam.datasets.imu_csv import HEADER, read_imu_csv
-from vslam.datasets.sources import SourceOptions, open_source
+from vslam.datasets.sources import open_source
 from vslam.support.errors import InputError
 from vslam.types.geometry import se3_exp
 from vslam.types.imu import GRAVITY, ImuCalibration
+from vslam.types.source_options import SourceOptions
 
 REAL = Path(__file__).parents[2] / "shared/data/euroc/V1_01_start"
 DEGREES = 57.29577951308232

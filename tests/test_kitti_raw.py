@@ -11,8 +11,9 @@ import pytest
 
 from vslam.datasets.fixes import read_fixes
 from vslam.datasets.kitti_raw import open_kitti_raw
-from vslam.datasets.sources import SourceOptions, open_source
+from vslam.datasets.sources import open_source
 from vslam.support.errors import InputError
+from vslam.types.source_options import SourceOptions
 
 SIZE, RAW_SIZE, FRAMES = (64, 32), (72, 40), 4
 DRIVE = "2011_09_26_drive_0005_sync"

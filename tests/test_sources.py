@@ -42,7 +42,6 @@ from vslam.datasets.detection import detect_dataset
 from vslam.datasets.frames import Source, TimedFrame, selected
 from vslam.datasets.image_folders import open_images
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.datasets.sources import SourceOptions
 from vslam.report.folder import create_run_folder
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
@@ -51,6 +50,7 @@ from vslam.run.recorder import Recorder
 from vslam.support.errors import InputError
 from vslam.types.camera import Camera
 from vslam.types.features import TrackingState
+from vslam.types.source_options import SourceOptions
 from vslam_lab.towns.layouts import write_side_by_side
 
 FRAMES = 12

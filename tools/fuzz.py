@@ -96,7 +96,8 @@ def _each(read: Callable[[str], object], names: Iterable[str]) -> None:
 
 
 def _read_source(dataset: str, data: str, folder: Path, **options) -> None:
-    from vslam.datasets.sources import SourceOptions, open_source
+    from vslam.datasets.sources import open_source
+    from vslam.types.source_options import SourceOptions
 
     if "calib" in options:
         options["calib"] = (folder / options["calib"],)

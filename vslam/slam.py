@@ -14,7 +14,8 @@ from vslam.config import Config, as_config
 from vslam.frontend.extraction import FrameImages, checked_images
 from vslam.frontend.track import GivenFeatures, Track
 from vslam.loopclosure.detector import LoopDetector
-from vslam.loopclosure.registry import DEFAULT_DETECTOR, detector_with_images
+from vslam.loopclosure.names import DEFAULT_DETECTOR
+from vslam.loopclosure.registry import detector_with_images
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, TruthAlignment

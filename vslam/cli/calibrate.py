@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 import typer
 
 from vslam.cli.console import Console
-from vslam.cli.options import METHOD, OUTPUT, option, reads_source
+from vslam.cli.options import option, reads_source
 from vslam.support.errors import BrokenSourceError, InputError, ResultsError
+from vslam.support.options import METHOD, OUTPUT
 
 if TYPE_CHECKING:
     from vslam.calibration.boards import Board
     from vslam.calibration.solve import Frame
     from vslam.datasets.frames import RawSource, TimedFrame
-    from vslam.datasets.sources import SourceOptions
     from vslam.types.camera import Image
+    from vslam.types.source_options import SourceOptions
 
 _EXAMPLES = """
 [b]Examples[/b]

@@ -10,7 +10,6 @@ import typer
 
 from vslam.cli.console import Console
 from vslam.cli.options import (
-    OUTPUT,
     Thresholds,
     open_given,
     option,
@@ -19,9 +18,10 @@ from vslam.cli.options import (
     require_data,
 )
 from vslam.support.errors import InputError, counted
+from vslam.support.options import OUTPUT
 
 if TYPE_CHECKING:
-    from vslam.datasets.sources import SourceOptions
+    from vslam.types.source_options import SourceOptions
 
 _EXAMPLES = """
 [b]Examples[/b]

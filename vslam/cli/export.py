@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import INPUT, OUTPUT, Quiet, flag, option
+from vslam.cli.options import Quiet, flag, option
 from vslam.support.errors import InputError, counted
+from vslam.support.options import INPUT, OUTPUT
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

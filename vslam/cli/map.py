@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import METHOD, OUTPUT, Quiet, Thresholds, option, read_thresholds
+from vslam.cli.options import Quiet, Thresholds, option, read_thresholds
 from vslam.support.errors import InputError, counted
+from vslam.support.options import METHOD, OUTPUT
 
 if TYPE_CHECKING:
     import numpy as np

@@ -10,35 +10,24 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
+from pydantic.fields import FieldInfo
 
-from vslam.support import plugins
+from vslam.loopclosure.names import detector_names
+from vslam.run.options import PERTURB, SEED, THRESHOLDS
 from vslam.support.errors import InputError
+from vslam.support.options import EXECUTION, INPUT, METHOD, OUTPUT, Option, options_of
+from vslam.types.source_options import DEPTH_CAMERAS, SourceOptions
 
 if TYPE_CHECKING:
     from vslam.cli.console import Console
     from vslam.config import Config
     from vslam.datasets.frames import Source
-    from vslam.datasets.sources import SourceOptions
 
 
-def _with_plugins(names: tuple[str, ...], group: str) -> tuple[str, ...]:
-    return (*names, *(name for name in plugins.find_plugins(group) if name not in names))
-
-
-_DATASETS = _with_plugins(("kitti", "kitti_raw", "euroc", "tum", "synthetic"), plugins.READERS)
-_DEPTH_CAMERAS = ("realsense", "oakd")
-_SOURCES = ("images", "video", "bag", "camera", *_DEPTH_CAMERAS)
-DETECTOR_NAMES = _with_plugins(
-    ("none", "bow", "both", "capsule", "capsule-pruned", "capsule-paper"), plugins.DETECTORS
-)
 if TYPE_CHECKING:
-    SourceName = str
     DetectorName = str
 else:  # plug-ins can add names
-    SourceName = Literal[(*_DATASETS, *_SOURCES)]
-    DetectorName = Literal[DETECTOR_NAMES]
-# Panels of --help.
-INPUT, METHOD, MAP, OUTPUT, EXECUTION = "Input", "Method", "Map", "Output", "Execution"
+    DetectorName = Literal[detector_names()]
 
 
 def option(
@@ -55,31 +44,27 @@ def flag(panel: str, text: str, *names: str) -> Any:
     return typer.Option(*names, help=text, rich_help_panel=panel)
 
 
+def shown_as(shown: Option, name: str) -> Any:
+    """Define the option of the field ``name`` of a model of options."""
+    names = [shown.name or f"--{name.replace('_', '-')}"]
+    if not shown.metavar:
+        return flag(shown.panel, shown.help, *names)
+    text = shown.help
+    if shown.choices is not None:
+        text = text.format(choices=", ".join(shown.choices()))
+    return option(
+        shown.panel, shown.metavar, text, *names, unset=shown.unset or True, min=shown.min
+    )
+
+
 def threads(unset: str, text: str = "Number of threads. It does not change the result.") -> Any:
     """Define the option ``--threads``. The text ``unset`` is shown as the default."""
     return option(EXECUTION, "N", text, min=1, unset=unset)
 
 
-Perturb = Annotated[
-    str,
-    option(
-        METHOD,
-        "LAWS",
-        "Perturbations of the images, with strengths, such as [b]fog:60,blur:0.5[/b]. "
-        "[b]vslam perturb --list[/b] shows all of them.",
-    ),
-]
-Seed = Annotated[int, option(METHOD, "N", "Seed of the random numbers.", min=0)]
-Thresholds = Annotated[
-    str | None,
-    option(
-        METHOD,
-        "FILE|NAME=VALUE",
-        "Thresholds: a JSON file, or values separated by commas, such as orb.n_features=1000 "
-        "(docs/reference/thresholds.md). [b]fast[/b] is faster but less accurate.",
-        "--config",
-    ),
-]
+Perturb = Annotated[str, shown_as(PERTURB, "perturb")]
+Seed = Annotated[int, shown_as(SEED, "seed")]
+Thresholds = Annotated[str | None, shown_as(THRESHOLDS, "config")]
 Weights = Annotated[
     list[str] | None,
     option(
@@ -148,7 +133,6 @@ OrbSlam3Vocabulary = Annotated[
     option(METHOD, "FILE", "Vocabulary of ORB-SLAM3, in DBoW2's text format.", "--vocabulary"),
 ]
 Quiet = Annotated[bool, flag(OUTPUT, "Show neither progress nor a summary.", "--quiet")]
-SensorName = Literal["stereo", "mono", "rgbd"]
 ViewerName = Literal["native", "web"]
 AlignmentName = Literal["se3", "sim3", "none"]
 
@@ -179,134 +163,39 @@ def sequences(default: str) -> Any:
     )
 
 
-def _source_options(
-    source: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="SOURCE",
-            help="The data to read, the same as [b]--data[/b].",
-            show_default=False,
-            rich_help_panel=INPUT,
-        ),
-    ] = None,
-    data: Annotated[
-        str | None,
-        option(
-            INPUT,
-            "DATA",
-            "Data set, folder of images, video, bag, or the number or URL of a camera "
-            "(docs/howto/sources.md).",
-            unset="$KITTI_ROOT, else data/kitti",
-        ),
-    ] = None,
-    dataset: Annotated[
-        SourceName | None,
-        option(
-            INPUT,
-            "KIND",
-            f"Kind of data: {', '.join((*_DATASETS, *_SOURCES))}.",
-            unset="detected from the files",
-        ),
-    ] = None,
-    seq: Annotated[
-        str | None,
-        option(INPUT, "NAME", "Sequence of a data set.", unset="00; not needed for EuRoC and TUM"),
-    ] = None,
-    calib: Annotated[
-        list[Path] | None,
-        option(
-            INPUT,
-            "FILE",
-            "Calibration file (docs/howto/cameras.md). If each camera has its own file, give the "
-            "option twice, the left camera first.",
-        ),
-    ] = None,
-    right: Annotated[
-        Path | None,
-        option(INPUT, "FOLDER", "Right images. [b]--data[/b] gives the left images."),
-    ] = None,
-    depth: Annotated[
-        Path | None,
-        option(INPUT, "FOLDER", "Depth images. [b]--data[/b] gives the grey or colour images."),
-    ] = None,
-    fps: Annotated[
-        float | None,
-        option(INPUT, "NUMBER", "Frames per second, for data without timestamps."),
-    ] = None,
-    side_by_side: Annotated[
-        bool, flag(INPUT, "Each image contains both views side by side.", "--side-by-side")
-    ] = False,
-    topics: Annotated[
-        str,
-        option(
-            INPUT,
-            "LEFT,RIGHT",
-            "Image topics of a bag: LEFT,RIGHT for stereo, one topic for mono, COLOUR,DEPTH for "
-            "RGB-D.",
-        ),
-    ] = "",
-    imu_topics: Annotated[
-        str,
-        option(
-            INPUT,
-            "TOPIC",
-            "IMU topic of a bag, or GYRO,ACCEL.",
-            unset=False,
-        ),
-    ] = "",
-    imu: Annotated[bool, flag(INPUT, "Whether to use the IMU.", "--imu/--no-imu")] = True,
-    depth_scale: Annotated[
-        float | None,
-        option(
-            INPUT,
-            "NUMBER",
-            "Value of a pixel at a depth of one metre.",
-            unset="from the calibration, data set or encoding",
-        ),
-    ] = None,
-    sensor: Annotated[
-        SensorName | None,
-        option(
-            INPUT,
-            "stereo|mono|rgbd",
-            "Images to use. [b]mono[/b] uses only the left images, and its scale is arbitrary.",
-            unset="all images of the data",
-        ),
-    ] = None,
-    mask: Annotated[
-        Path | None,
-        option(
-            INPUT,
-            "FILE|FOLDER",
-            "Mask image that is black where the left images must not be used, or a folder with "
-            "a mask for each image (docs/howto/masks.md).",
-        ),
-    ] = None,
-    start: Annotated[int, option(INPUT, "N", "First frame.", min=0)] = 0,
-    every: Annotated[int, option(INPUT, "N", "Use only every N-th frame.", min=1)] = 1,
-    max_frames: Annotated[
-        int | None, option(INPUT, "N", "Stop after N frames.", min=1, unset="all")
-    ] = None,
-) -> SourceOptions:
-    from vslam.datasets.sources import SourceOptions
+_SOURCE = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="SOURCE",
+        help="The data to read, the same as [b]--data[/b].",
+        show_default=False,
+        rich_help_panel=INPUT,
+    ),
+]
 
+
+def source_options(values: dict[str, Any]) -> SourceOptions:
+    """Take the options of the source out of the values of a command.
+
+    Without data, they name the folder of the KITTI data.
+
+    Raises:
+        InputError: the data are given twice or not at all.
+    """
+    names = [name for name, _ in options_of(SourceOptions) if name in values]
+    given = {name: values.pop(name) for name in names}
+    source, data = values.pop("source", None), given["data"]
     if source is not None and data is not None:
         raise InputError(f"{source}: data is also given with --data; leave one of the two out.")
-    data = source if source is not None else data
+    data, dataset = source if source is not None else data, given["dataset"]
     if data is None and dataset in (None, "kitti"):
         data = kitti_root()
-        dataset = "kitti" if data != KITTI_ROOT else dataset
-    elif data is None and dataset not in ("synthetic", *_DEPTH_CAMERAS):
+        given["dataset"] = "kitti" if data != KITTI_ROOT else dataset
+    elif data is None and dataset not in ("synthetic", *DEPTH_CAMERAS):
         raise InputError(f"--dataset {dataset}: give the data with --data.")
-    return SourceOptions(
-        data=data or "", dataset=dataset, seq=seq, calib=tuple(calib or ()), right=right,
-        depth=depth, fps=fps, side_by_side=side_by_side, topics=topics,
-        imu_topics=imu_topics, imu=imu, depth_scale=depth_scale,
-        sensor=sensor, mask=mask, start=start, every=every, max_frames=max_frames,
-    )  # fmt: skip
-
-
-_NAMES = {"SourceOptions": object}  # annotations whose types are slow to import
+    if "calib" in given:
+        given["calib"] = tuple(given["calib"] or ())
+    return SourceOptions(**given | {"data": data or ""})
 
 
 def reads_source(
@@ -318,14 +207,27 @@ def reads_source(
     Args:
         without: names of the options to leave out.
     """
+    return _takes(SourceOptions, without, source_options)
 
+
+def takes_options(
+    model: type[SourceOptions],
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorate a command. Its parameter ``given`` is replaced with the options of a model, and
+    receives their values by name."""
+    return _takes(model, (), lambda values: values)
+
+
+def _takes(
+    model: type[SourceOptions], without: tuple[str, ...], convert: Callable[[dict[str, Any]], Any]
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        source = [p for p in _parameters(_source_options) if p.name not in without]
+        source = [p for p in _parameters_of(model) if p.name not in without]
         own = [p for p in _parameters(command) if p.name != "given"]
 
         def called(**values: Any) -> None:
             given = {parameter.name: values.pop(parameter.name) for parameter in source}
-            command(given=_source_options(**given), **values)
+            command(given=convert(given), **values)
 
         called.__signature__ = inspect.Signature([*source, *own])  # type: ignore[attr-defined]
         called.__annotations__ = {p.name: p.annotation for p in (*source, *own)}
@@ -335,9 +237,28 @@ def reads_source(
     return decorate
 
 
+def _parameters_of(model: type[SourceOptions]) -> list[inspect.Parameter]:
+    """Return the options of a model as parameters of a command, after the argument SOURCE."""
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    found = [inspect.Parameter("source", keyword, default=None, annotation=_SOURCE)]
+    for name, shown in options_of(model):
+        annotation, default = _annotation(name, shown, model.model_fields[name])
+        found.append(inspect.Parameter(name, keyword, default=default, annotation=annotation))
+    return found
+
+
+def _annotation(name: str, shown: Option, field: FieldInfo) -> tuple[Any, Any]:
+    """Return the annotation of the parameter for a field, and its default."""
+    value = field.annotation if shown.given_as is None else shown.given_as | None
+    if shown.choices is not None:
+        value = Literal[shown.choices()] | None
+    default = None if shown.given_as is not None else field.default
+    return Annotated[value, shown_as(shown, name)], default
+
+
 def _parameters(function: Callable[..., object]) -> list[inspect.Parameter]:
     """Return the parameters of a function, with evaluated annotations."""
-    hints = get_type_hints(function, localns=_NAMES, include_extras=True)
+    hints = get_type_hints(function, localns={"SourceOptions": object}, include_extras=True)
     return [
         parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
         for name, parameter in inspect.signature(function).parameters.items()

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.console import Console
-from vslam.cli.options import OUTPUT, Perturb, Seed, flag, open_given, option, reads_source
+from vslam.cli.options import Perturb, Seed, flag, open_given, option, reads_source
 from vslam.support.errors import write_file
+from vslam.support.options import OUTPUT
 
 if TYPE_CHECKING:
-    from vslam.datasets.sources import SourceOptions
+    from vslam.types.source_options import SourceOptions
 
 _EXAMPLE = """
 [b]Examples[/b]

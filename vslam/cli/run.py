@@ -4,35 +4,25 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import Annotated, Any
 
 import typer
 
 from vslam.cli.drive import Output, drive
 from vslam.cli.options import (
-    DETECTOR_NAMES,
-    EXECUTION,
-    INPUT,
-    MAP,
-    METHOD,
-    OUTPUT,
-    DetectorName,
-    Perturb,
     Quiet,
-    Seed,
-    Threads,
-    Thresholds,
     ViewerName,
     flag,
     names_in,
     option,
     read_thresholds,
-    reads_source,
+    source_options,
+    takes_options,
 )
+from vslam.loopclosure.names import DEFAULT_DETECTOR, detector_names
+from vslam.run.options import RunOptions
 from vslam.support.errors import InputError
-
-if TYPE_CHECKING:
-    from vslam.datasets.sources import SourceOptions
+from vslam.support.options import MAP, OUTPUT
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -45,86 +35,18 @@ _EXAMPLES = """
   vslam run --resume runs/20261123-101500-kitti-00-none-bow
 """
 
-_OTHER_DETECTORS = ", ".join(name for name in DETECTOR_NAMES if name not in ("none", "both"))
-
-
 app = typer.Typer()
 
 
 @app.command(epilog=_EXAMPLES)
-@reads_source()
+@takes_options(RunOptions)
 def run(
     context: typer.Context,
-    given: SourceOptions,
-    gps: Annotated[
-        Path | None,
-        option(
-            INPUT,
-            "FILE",
-            "GPS fixes that georeference the trajectory: CSV, a bag, or the folder oxts of KITTI "
-            "raw (docs/howto/gps.md).",
-        ),
-    ] = None,
-    gps_antenna: Annotated[
-        str | None,
-        option(
-            INPUT,
-            "X,Y,Z",
-            "Position of the GPS antenna relative to the left camera: metres to the right, below "
-            "and ahead, such as [b]0.1,-0.5,-1.5[/b].",
-            unset="from KITTI's calibration, or 0,0,0",
-        ),
-    ] = None,
-    perturb: Perturb = "none",
-    seed: Seed = 0,
-    detector: Annotated[
-        DetectorName | None,
-        option(
-            METHOD,
-            "NAME",
-            "Loop detector: [b]both[/b] combines the capsule network and the bag of words, "
-            f"[b]none[/b] closes no loops. Other detectors: {_OTHER_DETECTORS}.",
-            unset="both, or the detector of --map",
-        ),
-    ] = None,
-    weights: Annotated[
-        Path | None,
-        option(
-            METHOD,
-            "FILE",
-            "ONNX file of the detector's network, from [b]vslam train[/b], or the vocabulary of "
-            "[b]bow[/b], from [b]vslam vocabulary[/b].",
-            unset="the shipped ones",
-        ),
-    ] = None,
-    local_weights: Annotated[
-        Path | None, option(METHOD, "FILE", "ONNX file of the local descriptors that verify loops.")
-    ] = None,
-    config: Thresholds = None,
-    compare: Annotated[
-        str,
-        option(
-            METHOD,
-            "NAMES",
-            "Other loop detectors, separated by commas. They run on the same frames, and a table "
-            "compares them.",
-        ),
-    ] = "",
-    map_file: Annotated[
-        Path | None,
-        option(MAP, "FILE|FOLDER", "Continue the map in a file, or the map of a run.", "--map"),
-    ] = None,
-    localize: Annotated[
-        bool, flag(MAP, "Localise in the map without changing it.", "--localize")
-    ] = False,
+    given: dict[str, Any],
     save_map: Annotated[
         Path | None,
         option(MAP, "FILE", "Also save the map to this file. An existing file is replaced."),
     ] = None,
-    autosave: Annotated[
-        float,
-        option(MAP, "SECONDS", "Time between saves of the map. 0 saves it only at the end.", min=0),
-    ] = 60.0,
     resume: Annotated[
         Path | None,
         option(
@@ -134,15 +56,6 @@ def run(
             "--view, --keep-open, --report, --ply, --save-map and --quiet can be given again.",
         ),
     ] = None,
-    threads: Threads = None,
-    realtime: Annotated[
-        bool,
-        flag(
-            EXECUTION,
-            "Process the frames in real time. Frames are dropped while tracking is too slow.",
-            "--realtime",
-        ),
-    ] = False,
     view: Annotated[
         ViewerName | None,
         option(
@@ -168,7 +81,7 @@ def run(
     quiet: Quiet = False,
 ) -> None:
     """Run SLAM on a sequence, and write the trajectory, map, recording and report to a folder."""
-    from vslam.loopclosure.registry import DEFAULT_DETECTOR, require_detector
+    from vslam.loopclosure.registry import require_detector
 
     if save_map is not None:
         from vslam.maps.new_output import require_place
@@ -190,15 +103,27 @@ def run(
         require_detector(options.detector, options.weights, f"--resume {resume}: detector")
         drive(options, output, resume=resume)
         return
+    drive(_checked(given), output, out=out)
+
+
+def _checked(given: dict[str, Any]) -> RunOptions:
+    """Check the options of a new run, and complete those that were not given."""
+    from vslam.config import as_config
+    from vslam.loopclosure.registry import require_detector
+    from vslam.support.machine import available_cores
+
+    source = source_options(given)
+    local_weights, map_file, gps = given["local_weights"], given["map_file"], given["gps"]
     if local_weights is not None and not local_weights.is_file():
         raise InputError(f"--local-weights {local_weights}: no such file; give an .onnx file.")
-    if localize and map_file is None:
+    if given["localize"] and map_file is None:
         raise InputError("--localize: give the map to localise in with --map.")
-    if localize and gps is not None:
+    if given["localize"] and gps is not None:
         raise InputError("--gps: changes the map, but --localize must not; leave one of them out.")
-    if gps_antenna is not None and gps is None:
+    antenna, compare, config = given["gps_antenna"], given["compare"] or "", given["thresholds"]
+    if antenna is not None and gps is None:
         raise InputError("--gps-antenna: give the fixes of this antenna with --gps.")
-    of_map: dict[str, object] = {}
+    detector, of_map = given["detector"], dict[str, object]()
     if map_file is not None:
         if compare:
             raise InputError(
@@ -206,36 +131,23 @@ def run(
             )
         map_file, detector, of_map = _map_to_continue(map_file, detector)
     detector = detector or DEFAULT_DETECTOR
-    require_detector(detector, weights)
+    require_detector(detector, given["weights"])
     compared = _compared(compare, detector)
-    if compared and realtime:
+    if compared and given["realtime"]:
         raise InputError(
             "--compare: in real time, each detector would make the others drop frames; leave "
             "out --realtime."
         )
-
-    from vslam.config import as_config
-    from vslam.run.options import RunOptions
-    from vslam.support.machine import available_cores
-
-    options = RunOptions(
-        **given.model_dump(),
-        perturb=perturb,
-        seed=seed,
-        gps=gps,
-        gps_antenna=None if gps_antenna is None else _antenna(gps_antenna),
-        threads=threads or min(available_cores(), 4),
-        detector=detector,
-        weights=weights,
-        local_weights=local_weights,
-        thresholds=as_config(of_map, str(map_file)) if config is None else read_thresholds(config),
-        map_file=map_file,
-        localize=localize,
-        compare=compared,
-        realtime=realtime,
-        autosave=autosave,
-    )
-    drive(options, output, out=out)
+    of_run = as_config(of_map, str(map_file)) if config is None else read_thresholds(config)
+    completed = {
+        "gps_antenna": None if antenna is None else _antenna(antenna),
+        "thresholds": of_run,
+        "threads": given["threads"] or min(available_cores(), 4),
+        "detector": detector,
+        "compare": compared,
+        "map_file": map_file,
+    }
+    return RunOptions(**source.model_dump(), **given | completed)
 
 
 _WITH_RESUME = {"resume", "record", "view", "keep_open", "pages", "ply", "save_map", "quiet"}
@@ -279,9 +191,7 @@ def _compared(names: str, detector: str) -> tuple[str, ...]:
     return found
 
 
-def _map_to_continue(
-    file: Path, detector: DetectorName | None
-) -> tuple[Path, DetectorName, dict[str, object]]:
+def _map_to_continue(file: Path, detector: str | None) -> tuple[Path, str, dict[str, object]]:
     """Return the map file, and the detector and the thresholds with which the map was made.
 
     The path of the map file is absolute, because ``runs/latest`` refers to a different folder as
@@ -295,9 +205,9 @@ def _map_to_continue(
         raise InputError(
             f"--detector {detector}: {file} was made with the detector {of_map}; leave it out."
         )
-    if of_map not in DETECTOR_NAMES:
+    if of_map not in detector_names():
         raise InputError(
             f"{file} was made with the detector {of_map}, a plug-in that is not installed here; "
             "install its package."
         )
-    return file.resolve(), cast("DetectorName", of_map), thresholds
+    return file.resolve(), of_map, thresholds

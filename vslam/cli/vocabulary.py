@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vslam.cli.options import OUTPUT, Quiet, Seed, option
+from vslam.cli.options import Quiet, Seed, option
 from vslam.support.errors import InputError, UnreadableImageError, counted
+from vslam.support.options import OUTPUT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -13,9 +13,9 @@ from typing import Any
 from vslam.datasets.frames import Source
 from vslam.support import plugins
 from vslam.support.errors import InputError, did_you_mean
+from vslam.types.source_options import DATASETS
 
 _DEFAULT_NAME = "00"  # of KITTI and of the rendered towns
-DATASETS = ("kitti", "kitti_raw", "euroc", "tum", "synthetic")  # plug-ins may add others
 
 
 def open_sequence(

@@ -7,8 +7,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict
-
 from vslam.calibration.files import NEEDED_CALIBRATION, read_calibration
 from vslam.calibration.models import Calibration
 from vslam.datasets import open_sequence
@@ -21,61 +19,7 @@ from vslam.datasets.kitti_raw import is_kitti_raw
 from vslam.datasets.masks import with_masks
 from vslam.datasets.rectified import rectified
 from vslam.support.errors import InputError
-
-DEPTH_CAMERAS = ("realsense", "oakd")
-LIVE = ("camera", *DEPTH_CAMERAS)
-SOURCES = ("images", "video", "bag", *LIVE)
-
-
-class SourceOptions(BaseModel):
-    """Options that select a source of frames and tell how to read it.
-
-    Attributes:
-        data: folder, file, device number or URL. For a depth camera, it is the serial number; if
-            the serial number is empty, the first camera that is found is used. ``data`` is ignored
-            for rendered towns.
-        dataset: one of `vslam.datasets.DATASETS` or of `SOURCES`, or the name of a data set that a
-            plug-in reads. None detects the data set from ``data``.
-        seq: name of the sequence of a data set, see `vslam.datasets.open_sequence`.
-        calib: calibration files, see `vslam.calibration.files.read_calibration`.
-        right: folder of the right images.
-        depth: folder of the depth images.
-        fps: frames per second. If it is given, the time stamps of the source are not used.
-        side_by_side: whether each frame contains the left and the right image side by side.
-        topics: for a bag, the topic of the left images, or two topics separated by a comma. The
-            second topic contains the right images or the depth images.
-        imu_topics: for a bag, the topic of the IMU, or those of its gyroscope and accelerometer,
-            separated by a comma.
-        imu: whether to use the IMU of the source.
-        depth_scale: depth image units per metre.
-        sensor: ``stereo``, ``rgbd`` or ``mono``. With ``mono``, only the left images are read. None
-            reads all images of the source.
-        mask: mask for all left images, or folder with a mask for each left image, see
-            `vslam.datasets.masks.with_masks`.
-        start, every, max_frames: read the frames ``start``, ``start + every`` and so on, at most
-            ``max_frames`` frames.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    data: str = ""
-    dataset: str | None = None
-    seq: str | None = None
-    calib: tuple[Path, ...] = ()
-    right: Path | None = None
-    depth: Path | None = None
-    fps: float | None = None
-    side_by_side: bool = False
-    topics: str = ""
-    imu_topics: str = ""
-    imu: bool = True
-    depth_scale: float | None = None
-    sensor: str | None = None
-    mask: Path | None = None
-    start: int = 0
-    every: int = 1
-    max_frames: int | None = None
-
+from vslam.types.source_options import DEPTH_CAMERAS, SOURCES, SourceOptions
 
 _APPLIES_TO = {
     "right": ("images",),

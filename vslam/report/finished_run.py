@@ -8,7 +8,7 @@ from itertools import zip_longest
 from pathlib import Path
 
 from vslam.datasets.frames import Source, TimedFrame, frames_at
-from vslam.datasets.sources import LIVE, open_source
+from vslam.datasets.sources import open_source
 from vslam.maps.storage import load_map
 from vslam.report.schema import ReportJson
 from vslam.run.options import read_options
@@ -16,6 +16,7 @@ from vslam.support.errors import InputError
 from vslam.types.camera import Camera, same_camera
 from vslam.types.loops import LoopEdge
 from vslam.types.map import Map
+from vslam.types.source_options import LIVE
 
 _SAME_TIME_S = 1e-6
 _WITHOUT_IMAGES = "export g2o, euroc or ply --no-colours, which need no images"

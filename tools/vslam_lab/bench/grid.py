@@ -12,9 +12,9 @@ from pathlib import Path
 
 from vslam.config import changed_thresholds
 from vslam.datasets.perturbation import law_kind, parse_perturbation
-from vslam.datasets.sources import SOURCES
 from vslam.report.schema import ReportJson
 from vslam.support.errors import InputError
+from vslam.types.source_options import SOURCES
 
 
 @dataclass(frozen=True, order=True)

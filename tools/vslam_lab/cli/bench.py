@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vslam.cli.options import (
-    METHOD,
-    OUTPUT,
     Detectors,
     Jobs,
     OrbSlam3Python,
@@ -29,11 +27,12 @@ from vslam.cli.options import (
     sequences,
 )
 from vslam.support.errors import counted
+from vslam.support.options import METHOD, OUTPUT
 from vslam_lab.cli.cells import choose_systems, open_cells
 from vslam_lab.cli.report import write_overview_of
 
 if TYPE_CHECKING:
-    from vslam.datasets.sources import SourceOptions
+    from vslam.types.source_options import SourceOptions
 
 _UNKNOWN_LENGTH = 1000  # frames; a stream of unknown length is assumed to be this long
 _FIRST_SEQUENCES = "00-05"

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 from vslam.cli.console import Console
 from vslam.cli.options import kind_of_source, names_in, open_given, read_thresholds
 from vslam.support.errors import InputError, did_you_mean
+from vslam.support.options import with_absolute_paths, words_of
 
 if TYPE_CHECKING:
     from vslam.datasets.frames import Source
-    from vslam.datasets.sources import SourceOptions
+    from vslam.types.source_options import SourceOptions
     from vslam_lab.bench.execute import CellOutcome, RunOptions
     from vslam_lab.bench.grid import Cell
 
@@ -212,41 +213,26 @@ def open_cells(
         threads=threads or max(1, min(available_cores() // jobs, 4)),
         scratch=None if scheduler else scratch_folder(out),
         others={name: (*program, name, command) for name, command in systems.others.items()},
-        source=tuple(_words_of(given)),
+        source=tuple(words_of(given, _OF_A_RUN)),
     )
     return Cells(kind, given, systems, opened, options, jobs, scheduler, out, console)
 
 
 def _absolute(given: SourceOptions) -> SourceOptions:
-    paths = {
-        name: path.absolute()
-        for name in ("right", "depth")
-        if (path := getattr(given, name)) is not None
-    }
-    data = given.data
-    if data and Path(data).exists():
-        data = str(Path(data).absolute())
-    calib = tuple(path.absolute() for path in given.calib)
-    return given.model_copy(update={**paths, "data": data, "calib": calib})
+    paths = with_absolute_paths(given)
+    if given.data and Path(given.data).exists():
+        paths["data"] = str(Path(given.data).absolute())
+    return given.model_copy(update=paths)
 
 
-def _words_of(given: SourceOptions) -> list[str]:
-    """Return the options of ``vslam run`` that describe the data and are the same for all runs."""
-    words = ["--side-by-side"] if given.side_by_side else []
-    values = {
-        "--right": given.right,
-        "--depth": given.depth,
-        "--fps": given.fps,
-        "--topics": given.topics or None,
-        "--depth-scale": given.depth_scale,
-    }
-    return words + [str(x) for pair in values.items() if pair[1] is not None for x in pair]
+# Each run has its own values of these options.
+_OF_A_RUN = ("data", "dataset", "seq", "calib", "sensor", "start", "every", "max_frames")
 
 
 def _identity(kind: str, given: SourceOptions) -> str:
     """Return a text that identifies the data of a benchmark."""
     if kind != "synthetic":
-        return " ".join([given.data, *_words_of(given), *map(str, given.calib)])
+        return " ".join([given.data, *words_of(given, _OF_A_RUN), *map(str, given.calib)])
     from vslam_lab.towns import Variation, store
 
     return f"rendered towns {store.folder_name(Variation())}"
@@ -259,7 +245,7 @@ def _open_all(
 
     Synthetic sequences are rendered here, so that parallel runs do not render the same sequence.
     """
-    from vslam.datasets.sources import LIVE
+    from vslam.types.source_options import LIVE
     from vslam_lab.bench.grid import parse_sequences
 
     named = f"--data {given.data}" if given.data else f"--dataset {kind}"

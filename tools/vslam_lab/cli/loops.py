@@ -9,9 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from vslam.cli.options import (
-    INPUT,
-    METHOD,
-    OUTPUT,
     AllThreads,
     Detectors,
     Quiet,
@@ -22,6 +19,7 @@ from vslam.cli.options import (
     require_writable,
 )
 from vslam.support.errors import InputError, counted
+from vslam.support.options import INPUT, METHOD, OUTPUT
 
 if TYPE_CHECKING:
     from vslam_lab.loopbench.schema import Gain, OnlineScore, Score

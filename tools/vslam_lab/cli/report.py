@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from vslam.cli.options import OUTPUT, Quiet, flag, option
+from vslam.cli.options import Quiet, flag, option
 from vslam.support.errors import counted
+from vslam.support.options import OUTPUT
 
 _EXAMPLES = """
 [b]Examples[/b]

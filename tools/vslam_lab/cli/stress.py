@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from vslam.cli.options import (
-    METHOD,
-    OUTPUT,
     Jobs,
     OrbSlam3Python,
     OrbSlam3Vocabulary,
@@ -27,11 +25,12 @@ from vslam.cli.options import (
     sequences,
 )
 from vslam.support.errors import InputError, did_you_mean
+from vslam.support.options import METHOD, OUTPUT
 from vslam_lab.cli.cells import choose_systems, open_cells
 
 if TYPE_CHECKING:
     from vslam.datasets.frames import Source
-    from vslam.datasets.sources import SourceOptions
+    from vslam.types.source_options import SourceOptions
 
 _EXAMPLES = """
 [b]Examples[/b]

@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from vslam.cli.options import OUTPUT, Quiet, Threads, flag, option
+from vslam.cli.options import Quiet, Threads, flag, option
 from vslam.support.errors import InputError, counted
+from vslam.support.options import OUTPUT
 
 _EXAMPLES = """
 [b]Examples[/b]

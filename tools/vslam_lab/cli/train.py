@@ -14,18 +14,9 @@ from typing import Annotated, Literal, get_args
 import typer
 
 from vslam.cli.export import app as export
-from vslam.cli.options import (
-    EXECUTION,
-    INPUT,
-    METHOD,
-    OUTPUT,
-    AllThreads,
-    Quiet,
-    flag,
-    option,
-    require_writable,
-)
+from vslam.cli.options import AllThreads, Quiet, flag, option, require_writable
 from vslam.support.errors import InputError, counted, write_file
+from vslam.support.options import EXECUTION, INPUT, METHOD, OUTPUT
 
 _TRAIN_EXAMPLES = """
 [b]Examples[/b]

@@ -17,7 +17,8 @@ from vslam.config import OrbConfig, SiameseConfig
 from vslam.frontend.orb import extract
 from vslam.loopclosure.bow_index import InvertedIndex
 from vslam.loopclosure.local_matching import DescriptorMaps
-from vslam.loopclosure.registry import DETECTORS, require_detector
+from vslam.loopclosure.names import DETECTORS
+from vslam.loopclosure.registry import require_detector
 from vslam.loopclosure.siamese.images import to_size
 from vslam.loopclosure.siamese.inference import open_network
 from vslam.loopclosure.vocabulary import Vocabulary, bow_vector

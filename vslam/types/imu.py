@@ -25,9 +25,9 @@ _NOT_A_ROTATION = 1e-2
 class ImuNoise:
     """The noise of an IMU, as continuous densities in the units of Kalibr's ``imu.yaml``.
 
-    The defaults are for an unknown IMU. They are about five times the densities in the data sheets
-    of cheap IMUs (for example Bosch's BMI055, 2.4e-4 and 1.5e-3), because vibration and
-    misalignment, which the model of the noise leaves out, are usually larger than the noise itself.
+    The defaults are those of cheap IMUs, such as Bosch's BMI055. Give the densities of the data
+    sheet or of a measurement at rest. Vibration and misalignment, which they leave out, are taken
+    into account where the noise is used (``backend/inertial_filter.py``).
 
     Attributes:
         gyro: density of the noise of the angular rate, in rad/s/sqrt(Hz).
@@ -39,9 +39,9 @@ class ImuNoise:
         ValueError: a density is not positive or not finite. The message names it.
     """
 
-    gyro: float = 1e-3
-    accel: float = 1e-2
-    gyro_walk: float = 5e-5
+    gyro: float = 2.5e-4
+    accel: float = 2e-3
+    gyro_walk: float = 2e-5
     accel_walk: float = 3e-3
 
     def __post_init__(self) -> None:
@@ -181,3 +181,27 @@ def _n_late(times: NDArray[np.float64]) -> int:
     if len(times) < 2:
         return 0
     return int(np.count_nonzero(times[1:] < np.maximum.accumulate(times)[:-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class InertialState:
+    """The state of an IMU that is moving through a world whose gravity is known.
+
+    The error of a state is ``(18,)``: the rotation (the true one is ``R exp(e)``), the position,
+    the velocity, gravity, and the biases of gyroscope and accelerometer, in this order.
+
+    Attributes:
+        timestamp: seconds, in the camera's clock.
+        T_world_imu: ``(4, 4)`` pose of the IMU.
+        velocity: ``(3,)`` m/s in the world frame.
+        gravity: ``(3,)`` acceleration of free fall in the world frame, ``GRAVITY`` m/s^2 long.
+        bias: ``(6,)`` bias of the gyroscope in rad/s and of the accelerometer in m/s^2.
+        covariance: ``(18, 18)`` of the error.
+    """
+
+    timestamp: float
+    T_world_imu: Matrix
+    velocity: Matrix
+    gravity: Matrix
+    bias: Matrix
+    covariance: Matrix

@@ -176,6 +176,21 @@ def in_another_world(state: InertialState, T_new_world: Matrix) -> InertialState
     )
 
 
+def anchored(state: InertialState, T_world_imu: Matrix) -> InertialState:
+    """Return the state in a world frame in which the IMU is known to be at a given pose.
+
+    The error of the pose becomes zero. What the IMU knows about velocity and gravity in its own
+    frame stays as uncertain as it was.
+    """
+    R, F = state.T_world_imu[:3, :3], np.eye(N)
+    F[TURN] = F[PLACE] = 0.0
+    F[SPEED, TURN] = _cross_matrix(state.velocity) @ R
+    F[FALL, TURN] = _cross_matrix(state.gravity) @ R
+    T_new_world = T_world_imu @ inverse(state.T_world_imu)
+    known = replace(state, covariance=F @ state.covariance @ F.T)
+    return in_another_world(known, T_new_world)
+
+
 def _corrected(state: InertialState, H: Matrix, error: Matrix, noise: Matrix) -> Correction:
     """Correct a state with a measurement ``H e`` of its error (Joseph's form)."""
     P = state.covariance

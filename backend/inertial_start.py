@@ -132,7 +132,8 @@ def find_gyro_bias(
     noise = inflated(calibration.noise)
     C = stretch.sigma_rad**2 * np.eye(len(times))
     C += noise.gyro**2 * np.minimum.outer(times, times)
-    L, bias = np.linalg.cholesky(C), np.zeros(6)
+    L: Matrix = np.linalg.cholesky(C).astype(np.float64)
+    bias = np.zeros(6)
     start, x, H, rhs = rotations[0], np.zeros(6), np.eye(6), np.zeros(6)
     for _ in range(_ITERATIONS):
         now = [motion.with_bias(bias) for motion in motions]
@@ -152,7 +153,8 @@ def find_gyro_bias(
         start = start @ so3_exp(x[:3])
         bias[:3] += x[3:]
     misfit = float(np.sum((rhs - A @ x) ** 2) / max(3 * len(times) - 6, 1))
-    return GyroBias(bias[:3], np.linalg.inv(H)[3:, 3:], misfit)
+    covariance: Matrix = np.linalg.inv(H)[3:, 3:].astype(np.float64)
+    return GyroBias(bias[:3], covariance, misfit)
 
 
 def find_gravity(
@@ -228,10 +230,12 @@ def _fit(
     d = np.array([R @ motion.position for motion in motions])
     D = np.array([R @ motion.by_bias[6:, 3:] for motion in motions])
     gravity = _mean_force_down(R, motions[-1])
-    scale, x = 1.0, np.zeros(12)
+    scale = 1.0
+    x: Matrix = np.zeros(12)
+    L: Matrix = np.eye(n)
     for _ in range(_ITERATIONS):
         sigma = stretch.sigma_m * (1.0 if known_scale else abs(scale))
-        L = np.linalg.cholesky(_position_covariance(times, sigma, calibration))
+        L = np.linalg.cholesky(_position_covariance(times, sigma, calibration)).astype(np.float64)
         B = _tangent(gravity)  # gravity changes by B w, which keeps its length to first order
         A = np.zeros((n, 3, 12))
         A[:, :, 0:3] = np.eye(3)
@@ -245,7 +249,7 @@ def _fit(
         prior[8:11] = ACCEL_BIAS**-2
         prior[11] = 1e24 if known_scale else 0.0
         H = A.T @ A + np.diag(prior)
-        x = np.linalg.solve(H, A.T @ y)
+        x = np.linalg.solve(H, A.T @ y).astype(np.float64)
         gravity = gravity + B @ x[6:8]
         gravity *= GRAVITY / np.linalg.norm(gravity)
         scale = 1.0 if known_scale else float(x[11])
@@ -325,8 +329,9 @@ def _position_covariance(
 def _whitened(L: Matrix, A: Matrix, y: Matrix) -> tuple[Matrix, Matrix]:
     """Whiten ``(N, 3, M)`` rows and ``(N, 3)`` right sides, and stack the three axes."""
     n, _, m = A.shape
-    rows = np.linalg.solve(L, A.reshape(n, 3 * m)).reshape(3 * n, m)
-    return rows, np.linalg.solve(L, y).reshape(3 * n)
+    rows: Matrix = np.linalg.solve(L, A.reshape(n, 3 * m)).reshape(3 * n, m).astype(np.float64)
+    right: Matrix = np.linalg.solve(L, y).reshape(3 * n).astype(np.float64)
+    return rows, right
 
 
 def _mean_force_down(R: Matrix, motion: Preintegration) -> Matrix:

@@ -15,6 +15,7 @@ from vslam.frontend.sides import Sides
 from vslam.types.camera import Image
 from vslam.types.features import Extracted, Features, Keypoints, Pyramid, TrackingState
 from vslam.types.geometry import Matrix
+from vslam.types.imu import InertialState
 from vslam.types.loops import LastSeen
 from vslam.types.map_view import MapView
 from vslam.types.states import Standstill
@@ -75,6 +76,8 @@ class By(StrEnum):
 
     PREDICTION = "prediction"
     """The pose was predicted with constant velocity. The frame is lost or was dropped."""
+    INERTIA = "inertia"
+    """The pose was predicted from the samples of the IMU."""
     PATCHES = "patches"
     """Image patches of landmarks were found in the image. No features were extracted."""
     STANDSTILL = "standstill"
@@ -106,7 +109,7 @@ class Track:
             feature observes none.
         shift: ``(N, 2)`` float32 offset from each feature to its aligned position, in pixels; NaN
             where the match was not aligned. None if no match was aligned.
-        state: OK, WEAK, LOST or DROPPED.
+        state: how the frame was tracked.
         by: how the pose was found.
         near: id of the keyframe at which the frame was relocalised; -1 if it was not relocalised.
         n_matches, n_inliers: number of matched landmarks before and after the last pose
@@ -151,7 +154,7 @@ class Track:
     @property
     def is_lost(self) -> bool:
         """Whether the pose was only predicted."""
-        return self.state in (TrackingState.LOST, TrackingState.DROPPED)
+        return self.state in (TrackingState.LOST, TrackingState.INERTIAL, TrackingState.DROPPED)
 
     @property
     def by_patches(self) -> bool:
@@ -223,6 +226,8 @@ class Prediction:
         is_resumed: whether the camera continues from the end of an earlier drive.
         seconds: duration of the motion since the frame before (``motion_seconds``).
         times: ``(N,)`` timestamps of the frames before, in seconds (at most ``RECENT``).
+        inertial: the state of the IMU from which the pose was predicted; None if it was predicted
+            with constant velocity.
     """
 
     index: int
@@ -234,6 +239,7 @@ class Prediction:
     is_resumed: bool = False
     seconds: float = 0.0
     times: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    inertial: InertialState | None = None
 
     @property
     def interval(self) -> float:

@@ -116,3 +116,43 @@ def recording(name: str) -> Recording:
         states[:, 8:11],
         states[:, 11:17],
     )
+
+
+@dataclass(frozen=True)
+class Walk(Flight):
+    """A hand-held walk along z of a world whose y axis points down, like that of a camera.
+
+    The pose is that of the camera, which sways. ``velocity`` and ``position`` hold it too.
+    """
+
+    speed: float = 0.06
+    turning: float = 0.06
+    gravity: tuple[float, ...] = (0.0, GRAVITY, 0.0)
+    along: float = 1.4  # m/s
+
+    def position(self, t) -> np.ndarray:
+        t = np.asarray(t, float)
+        return super().position(t) + t[..., None] * np.array([0.0, 0.0, self.along])
+
+    def velocity(self, t) -> np.ndarray:
+        return super().velocity(t) + np.array([0.0, 0.0, self.along])
+
+
+def seen_by(samples: np.ndarray, T_imu_camera: np.ndarray, flight: Flight) -> np.ndarray:
+    """Return the samples of an IMU that is mounted elsewhere on the body whose samples are given.
+
+    Args:
+        T_imu_camera: ``(4, 4)``, maps points of the body to the IMU.
+    """
+    R, arm = T_imu_camera[:3, :3], np.linalg.inv(T_imu_camera)[:3, 3]
+    times, rates, moved = samples[:, 0], samples[:, 1:4], samples.copy()
+    step = 1e-4
+    for k, t in enumerate(times):
+        ends = [flight._sines(np.array(t + s), 0, 1) for s in (-step, step)]
+        slopes = [flight._sines(np.array(t + s), 1, 1) for s in (-step, step)]
+        w0, w1 = (right_jacobian(a) @ b for a, b in zip(ends, slopes, strict=True))
+        turning = (w1 - w0) / (2 * step)
+        w = rates[k]
+        force = samples[k, 4:] + np.cross(turning, arm) + np.cross(w, np.cross(w, arm))
+        moved[k, 1:4], moved[k, 4:] = R @ w, R @ force
+    return moved

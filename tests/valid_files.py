@@ -251,7 +251,7 @@ def map_file(folder: Path) -> None:
     )
     frames = FrameTable(
         0.1 * np.arange(3), np.array([0, 2, 2]), np.tile(np.eye(4), (3, 1, 1)), np.ones(3, bool),
-        np.ones(3),
+        np.ones(3), np.zeros(3, bool),
     )  # fmt: skip
     stored = StoredMap(map_, _camera(), frames=frames, checkpoint=checkpoint)
     save_map(folder / "map.npz", stored, resumable=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vslam.config import Config, as_config
 from vslam.frontend.extraction import FrameImages, checked_images
@@ -20,6 +20,7 @@ from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.method.gaps import Gap, find_gaps
+from vslam.method.inertia import IMU_REFUSED, is_refused
 from vslam.method.map_frames import in_first_part, keyframe_trajectory
 from vslam.method.session import Session
 from vslam.support.errors import InputError
@@ -27,6 +28,7 @@ from vslam.support.workers import Workers
 from vslam.types.camera import Camera, DepthImage, Image
 from vslam.types.context import Context
 from vslam.types.features import Extracted, TrackResult
+from vslam.types.imu import ImuCalibration, tidied
 from vslam.types.loops import LoopCorrection, LoopEdge
 from vslam.types.map import Map
 from vslam.types.trajectory import Trajectory
@@ -72,6 +74,7 @@ class Slam:
         start: StoredMap | None = None,
         localize: bool = False,
         resume: bool = False,
+        imu: ImuCalibration | None = None,
     ) -> None:
         """Begin SLAM with a new map, or continue in a stored map.
 
@@ -94,6 +97,9 @@ class Slam:
             resume: continue the last drive of the map ``start`` instead of beginning a new drive.
                 The poses equal those of an uninterrupted drive only if the map was saved with
                 ``resumable=True``.
+            imu: where the IMU is on the rectified left camera, and its noise. Its samples are
+                passed to ``step`` or ``add_imu``. They are used only if the camera measures depth.
+                None if there is no IMU.
 
         Raises:
             ValueError: the map cannot be continued. The message gives the reason in a few words.
@@ -106,8 +112,9 @@ class Slam:
         self.detector = detector
         self.workers = Workers(threads)
         self._session = Session(
-            context, detector, images, self.workers, start, localize=localize, resume=resume
-        )
+            context, detector, images, self.workers, start,
+            localize=localize, resume=resume, imu=None if camera.monocular else imu,
+        )  # fmt: skip
         self.rig = self._session.rig
 
     @classmethod
@@ -181,6 +188,7 @@ class Slam:
         timestamp: float,
         *,
         mask: NDArray[np.uint8] | NDArray[np.bool_] | None = None,
+        imu: ArrayLike | None = None,
         on_pose: Callable[[TrackResult], None] = _ignore,
     ) -> TrackResult:
         """Track one rectified stereo pair, RGB-D image or monocular image.
@@ -198,16 +206,20 @@ class Slam:
             timestamp: seconds. It must be later than the timestamp of the last call.
             mask: ``(H, W)`` uint8 or bool. It is 0 where the left image must not be used, for
                 example where it shows the hood of the car. None uses the whole image.
+            imu: ``(N, 7)`` samples of the IMU since the last call, see ``add_imu``. None if there
+                is no IMU, or if ``add_imu`` is used.
             on_pose: function that is called with the result as soon as the pose is known, before a
                 keyframe is inserted. ``is_keyframe`` may not be decided yet. Exceptions of this
                 function are passed on.
 
         Raises:
-            ValueError: the images have the wrong size or type, or the timestamp is not finite or
-                not later than the last timestamp.
+            ValueError: the images or samples have the wrong size or type, or the timestamp is not
+                finite or not later than the last timestamp.
             RuntimeError: mapping an earlier keyframe failed, so that the map is incomplete.
         """
         images = checked_images(left, second, mask, self.context)
+        if imu is not None:
+            self.add_imu(imu)
         return self.step_images(images, timestamp, on_pose=on_pose)
 
     def step_images(
@@ -227,6 +239,23 @@ class Slam:
             on_pose: as in ``step``.
         """
         return self._session.step(images, timestamp, stage_ms, on_pose)
+
+    def add_imu(self, samples: ArrayLike) -> None:
+        """Add samples of the IMU, for example as soon as they arrive from a live sensor.
+
+        Samples that are not in order are sorted. Repeated times, and rows with numbers that are not
+        finite, are left out. A frame uses the samples that were added before its step. If the last
+        of them is a little earlier than the frame, it is continued. If samples are missing for more
+        than 0.1 s, the motion is predicted without the IMU.
+
+        Args:
+            samples: ``(N, 7)`` seconds in the clock of the camera, angular rate x, y and z in
+                rad/s, specific force x, y and z in m/s^2, in the frame of the IMU.
+
+        Raises:
+            ValueError: the shape is wrong.
+        """
+        self._session.add_imu(tidied(samples).samples)
 
     def step_features(
         self,
@@ -307,7 +336,8 @@ class Slam:
         Such failures are a failed search for loops, a failed global bundle adjustment, and a right
         image that could not be read.
         """
-        return [*self._session.closing.problems, *self.rig.problems]
+        refused = [IMU_REFUSED] if is_refused(self._session.inertia) else []
+        return [*self._session.closing.problems, *self.rig.problems, *refused]
 
     @property
     def corrections(self) -> list[LoopCorrection]:

@@ -18,11 +18,11 @@ from vslam.types.camera import Camera
 from vslam.types.frame_poses import FrameTable
 from vslam.types.loops import DetectorMemory, LoopEdge, PerKeyframe
 from vslam.types.map import (
+    CARRIED,
     KEYFRAME_FIELDS,
     LANDMARK_FIELDS,
     NONE,
     ROW_FIELDS,
-    UNPREDICTED,
     Arrays,
     KeyframeTable,
     Map,
@@ -80,6 +80,7 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "frame_reference": (np.int64, ("F",)),
     "frame_T_c_reference": (np.float64, ("F", 4, 4)),
     "frame_tracked": (np.bool_, ("F",)),
+    "frame_carried": (np.bool_, ("F",)),
     "frame_unit_scale": (np.float64, ("F",)),
 }
 _MAY_BE_NAN = {"row_u_right", "revisit_uvr", "loop_covariance"}
@@ -186,7 +187,7 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     _require(bool((parent[1:] >= 0).all() and (parent < np.arange(n)).all()), "keyframe_parent")
     _check_ids("keyframe_parent", parent, n, least=NONE)
     _require(bool((data["keyframe_unit_scale"] > 1 / _MOST).all()), "keyframe_unit_scale")
-    _check_ids("keyframe_restart", data["keyframe_restart"], UNPREDICTED + 1)
+    _check_ids("keyframe_restart", data["keyframe_restart"], CARRIED + 1)
     _require(not data["keyframe_restart"][:1].any(), "the first keyframe has a restart")
     _check_ids("row_octave", data["row_octave"], len(scales))
     _require(bool((data["row_certainty"] > 0).all()), "row_certainty")

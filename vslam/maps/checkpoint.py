@@ -13,7 +13,7 @@ from vslam.types.features import PATCH_PIXELS
 from vslam.types.map import Map
 from vslam.types.states import Checkpoint, MapperState, TrackerState
 
-SCHEMA = 3
+SCHEMA = 4
 _MOST = 1e12  # metres, pixels or seconds
 LOOP_SHAPES = {
     "LoopEdge.T_query_match": (4, 4),
@@ -49,6 +49,14 @@ CHECKPOINTS = Codec(
         "PoseUncertainty.drift": (6, 6),
         "PoseUncertainty.offset": (6,),
         "PoseUncertainty.gaps": (6, 6),
+        "Inertia.samples": ("N", 7),
+        "Inertia.times": ("M",),
+        "Inertia.poses": ("M", 4, 4),
+        "InertialState.T_world_imu": (4, 4),
+        "InertialState.velocity": (3,),
+        "InertialState.gravity": (3,),
+        "InertialState.bias": (6,),
+        "InertialState.covariance": (18, 18),
     },
     most=_MOST,
     unbounded=frozenset(("Features.u_right", "MapperState.last_timestamp", "LoopEdge.covariance")),

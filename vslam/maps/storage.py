@@ -29,7 +29,7 @@ from vslam.types.camera import Camera
 from vslam.types.frame_poses import FrameTable
 from vslam.types.map_kernels import gather_observations, resolve
 
-SCHEMA = 10
+SCHEMA = 11
 _UNKNOWN = np.full((6, 6), np.nan)  # covariance
 _FOREIGN = "not a map of vslam; give a map.npz or the folder of a run"
 
@@ -107,7 +107,12 @@ def _as_arrays(stored: StoredMap) -> dict[str, NDArray]:
     loops = stored.loops
     T = [loop.T_query_match for loop in loops]
     frames = stored.frames or FrameTable(
-        np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros(0, np.bool_), np.zeros(0)
+        np.zeros(0),
+        np.zeros(0, np.int64),
+        np.zeros((0, 4, 4)),
+        np.zeros(0, np.bool_),
+        np.zeros(0),
+        np.zeros(0, np.bool_),
     )
     header: dict[str, Any] = {
         "kind": "vslam map",

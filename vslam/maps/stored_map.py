@@ -14,9 +14,11 @@ from vslam.types.frame_poses import FrameTable
 from vslam.types.geometry import inverses, orthonormalised
 from vslam.types.loops import DetectorMemory, LoopEdge, PerKeyframe, ranges
 from vslam.types.map import (
+    CARRIED,
     KEYFRAME_FIELDS,
     LANDMARK_FIELDS,
     NONE,
+    PREDICTED,
     ROW_FIELDS,
     UNPREDICTED,
     KeyframeTable,
@@ -293,7 +295,8 @@ def _spanning_tree(
     begins = np.array(map_.restarts, np.int64)
     position = np.searchsorted(keyframes, begins)
     inside = (position > 0) & (position < n)
-    np.maximum.at(restart, position[inside], map_.keyframes.restart[begins[inside]])
+    for how in (CARRIED, PREDICTED, UNPREDICTED):  # the least that is known counts
+        restart[position[inside & (map_.keyframes.restart[begins] == how)]] = how
 
     orphans = 1 + np.flatnonzero(parent[1:] < 0)
     parent[orphans] = 0

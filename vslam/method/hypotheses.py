@@ -37,7 +37,7 @@ from vslam.backend.similarity_graph import (
 from vslam.config import PoseGraphConfig
 from vslam.types.geometry import Matrix, compose, inverse, inverses, orthonormalised
 from vslam.types.loops import LoopEdge
-from vslam.types.map import Map
+from vslam.types.map import CARRIED, Map
 
 
 class Hypothesis(Enum):
@@ -141,10 +141,14 @@ def _without_odometry(graph: PoseGraph, places: NDArray[np.int64]) -> PoseGraph:
 def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:
     """Return the index of the sub-map of each keyframe as an ``(n_keyframes,)`` array.
 
-    Sub-maps that are joined by a closed loop count as one sub-map.
+    Sub-maps that are joined by a closed loop, or by the motion that an IMU measured, count as one
+    sub-map.
     """
     submap = map_.submaps()
-    ends = np.array([(edge.query, edge.match) for edge in closed], np.int64).reshape(-1, 2)
+    carried = np.flatnonzero(map_.keyframes.restart[: map_.n_keyframes] == CARRIED)
+    joined = [(edge.query, edge.match) for edge in closed]
+    joined += [(int(one), int(map_.parents[one])) for one in carried]
+    ends = np.array(joined, np.int64).reshape(-1, 2)
     return parts_of(submap[ends], len(submap))[submap]
 
 

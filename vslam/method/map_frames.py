@@ -16,6 +16,7 @@ from vslam.frontend.rig import with_offset
 from vslam.frontend.track import Track
 from vslam.method.hypotheses import joined_submaps
 from vslam.method.starter import TwoViewStart
+from vslam.types.features import TrackingState
 from vslam.types.frame_poses import FramePoses
 from vslam.types.geometry import compose, inverse, inverses, orthonormalised, transform
 from vslam.types.loops import LoopEdge
@@ -57,7 +58,8 @@ def add_frame(
         if len(neighbours):
             map_.parents[keyframe] = int(neighbours[0])
         else:
-            map_.begin_submap(keyframe, reference, predicted=predicted)
+            carried = track.state == TrackingState.INERTIAL
+            map_.begin_submap(keyframe, reference, predicted=predicted, carried=carried)
     return keyframe
 
 

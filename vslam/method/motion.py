@@ -10,6 +10,17 @@ from vslam.frontend.motion_time import RECENT, motion_seconds
 from vslam.frontend.standstill import has_come_to_rest, is_small
 from vslam.frontend.track import By, Prediction, Track
 from vslam.frontend.tracking import uncertainty_of
+from vslam.method.inertia import (
+    CARRIED_S,
+    Inertia,
+    lost,
+    predicted_covariance,
+    predicted_motion,
+    predicted_state,
+    tracked,
+    with_samples,
+)
+from vslam.method.inertia import found_again as anew
 from vslam.types.context import Context
 from vslam.types.features import TrackingState, TrackResult
 from vslam.types.frame_poses import FramePoses
@@ -21,6 +32,7 @@ from vslam.types.geometry import (
     se3_exp,
     se3_log,
 )
+from vslam.types.imu import ImuCalibration, InertialState
 from vslam.types.map_view import MapView
 from vslam.types.odometry import Odometry, OdometryState
 from vslam.types.states import Standstill
@@ -32,15 +44,22 @@ class Motion:
     Attributes:
         odometry: the pose that drifts but never jumps, and its uncertainty.
         lost_frames: number of frames that have been lost since the last one was tracked.
+        inertia: what is known from the IMU.
     """
 
-    def __init__(self, context: Context, frames: FramePoses) -> None:
+    def __init__(
+        self, context: Context, frames: FramePoses, imu: ImuCalibration | None = None
+    ) -> None:
         """
         Args:
             frames: the recorded poses of all frames, including lost frames. They move with the map.
+            imu: where the IMU is on the left camera as it is mounted, and its noise; None if there
+                is no IMU.
         """
         self.odometry = Odometry()
         self.lost_frames = 0
+        self.inertia = Inertia()
+        self._imu = imu
         self._context = context
         self._frames = frames
         self._is_resumed = False
@@ -49,9 +68,10 @@ class Motion:
     def predict(self, timestamp: float, last: Track | None, view: MapView) -> Prediction:
         """Predict the pose of the next frame.
 
-        The camera is assumed to keep its velocity. The velocity is measured per second, not per
-        frame, so that dropped frames do not distort the prediction. Before the first frame of a
-        drive, the camera is expected at the reference keyframe.
+        If the state of the IMU is known, its samples give the motion since the last frame.
+        Otherwise, the camera is assumed to keep its velocity. The velocity is measured per second,
+        not per frame, so that dropped frames do not distort the prediction. Before the first frame
+        of a drive, the camera is expected at the reference keyframe.
 
         Args:
             timestamp: of the next frame, in seconds.
@@ -64,6 +84,13 @@ class Motion:
             T_cw, seconds = self._frames.pose(-1), motion_seconds(np.append(times, timestamp))
             if twist is not None:
                 T_cw = orthonormalised(se3_exp(twist * seconds) @ T_cw)
+        inertial = None
+        if self._imu is not None:
+            inertial = predicted_state(self.inertia, timestamp, self._imu)
+        if inertial is not None and self._imu is not None:
+            T_odom_camera = self.odometry.state.T_odom_camera
+            T_now_last = self._as_tracked(predicted_motion(inertial, T_odom_camera, self._imu))
+            T_cw = orthonormalised(T_now_last @ self._frames.pose(-1))
         return Prediction(
             len(self._frames),
             timestamp,
@@ -74,6 +101,7 @@ class Motion:
             self._is_resumed,
             seconds,
             times,
+            inertial,
         )
 
     def advance(self, track: Track, predicted: Prediction, view: MapView) -> Track:
@@ -85,18 +113,73 @@ class Motion:
         """
         known = predicted.twist is not None
         if track.is_lost:
-            self._follow(track, track.T_cw, known_velocity=known)
-            self.lost_frames += track.state == TrackingState.LOST
+            track = self._carried(track, predicted)
+            self._follow(track, track.T_cw, known_velocity=known, inertial=predicted.inertial)
+            self.lost_frames += track.state != TrackingState.DROPPED
             return track
         found_again = track.by is By.PLACE or not predicted.is_tracking
         track = self._with_velocity(track, predicted, view)
         covariance, of_offset = uncertainty_of(track, view.offset_sigma, self._context)
         T_moved = predicted.T_cw if found_again else track.T_cw
         self._follow(
-            track, T_moved, covariance, of_offset, found_again=found_again, known_velocity=known
-        )
+            track, T_moved, covariance, of_offset, found_again=found_again, known_velocity=known,
+            inertial=predicted.inertial,
+        )  # fmt: skip
+        self._update_inertia(track, predicted, found_again=found_again)
         self.lost_frames = 0
         return track
+
+    def add_samples(self, samples: Matrix) -> None:
+        """Add samples of the IMU, see ``Slam.add_imu``."""
+        self.inertia = with_samples(self.inertia, samples)
+
+    def gravity(self, T_wc: Matrix) -> Matrix | None:
+        """Return the ``(3,)`` acceleration of free fall in the world frame of the map, in m/s^2.
+
+        Args:
+            T_wc: ``(4, 4)`` pose of the last frame in the map, of the camera as it is mounted.
+        """
+        state = self.inertia.state
+        if state is None:
+            return None
+        R_odom_camera = self.odometry.state.T_odom_camera[:3, :3]
+        gravity: Matrix = T_wc[:3, :3] @ R_odom_camera.T @ state.gravity
+        return gravity
+
+    def _carried(self, track: Track, predicted: Prediction) -> Track:
+        """Follow the IMU to a frame that was not tracked. Return the frame with its state."""
+        if self._imu is None or not len(self._frames):
+            return track
+        elapsed = track.timestamp - self._frames.timestamp(-1)
+        self.inertia = lost(self.inertia, predicted.inertial, elapsed)
+        if predicted.inertial is None or self.inertia.carried_s > CARRIED_S:
+            return track
+        if track.state != TrackingState.LOST:
+            return track
+        return replace(track, state=TrackingState.INERTIAL, by=By.INERTIA)
+
+    def _update_inertia(self, track: Track, predicted: Prediction, *, found_again: bool) -> None:
+        """Learn from a tracked frame, to which the odometry has moved."""
+        if self._imu is None:
+            return
+        odometry, inertial = self.odometry.state, predicted.inertial
+        T_odom_camera, local = odometry.T_odom_camera, odometry.now.local
+        if found_again:
+            self.inertia = anew(self.inertia, inertial, T_odom_camera, self._imu)
+            return
+        self.inertia = tracked(
+            self.inertia, inertial, track.timestamp, T_odom_camera, local, self._imu,
+            stands_still=track.by is By.STANDSTILL,
+        )  # fmt: skip
+
+    def _as_tracked(self, T_now_last: Matrix) -> Matrix:
+        """Return a motion of the camera as it is mounted as a motion of the camera that is tracked,
+        whose images may be turned."""
+        if not self._context.camera.quarter_turns:
+            return T_now_last
+        T = self._context.camera.T_mounted_camera
+        turned: Matrix = T.T @ T_now_last @ T
+        return turned
 
     def keyframe(self) -> None:
         """Note that the last frame became a keyframe."""
@@ -116,9 +199,9 @@ class Motion:
         if last.T_odom_camera is not None and last.uncertainty is not None:
             self.odometry = Odometry(OdometryState(last.T_odom_camera, last.uncertainty, 0.0))
 
-    def restore(self, odometry: OdometryState, lost_frames: int) -> None:
+    def restore(self, odometry: OdometryState, lost_frames: int, inertia: Inertia) -> None:
         """Restore the state of a checkpoint."""
-        self.odometry, self.lost_frames = Odometry(odometry), lost_frames
+        self.odometry, self.lost_frames, self.inertia = Odometry(odometry), lost_frames, inertia
 
     def _with_velocity(self, track: Track, predicted: Prediction, view: MapView) -> Track:
         """Return a tracked frame with its velocity since the last tracked frame, and with the place
@@ -165,6 +248,7 @@ class Motion:
         *,
         found_again: bool = False,
         known_velocity: bool,
+        inertial: InertialState | None = None,
     ) -> None:
         """Move the odometry.
 
@@ -173,6 +257,7 @@ class Motion:
                 frame. It differs from the pose of the frame in the map if the camera was
                 relocalised.
             covariance, of_offset, found_again, known_velocity: see ``Odometry.move``.
+            inertial: the state of the IMU from which the pose was predicted, if it was.
         """
         frames, camera = self._frames, self._context.camera
         T_now_last, elapsed = np.eye(4), 0.0
@@ -185,7 +270,10 @@ class Motion:
             T_now_last = T @ T_now_last @ T.T
             covariance = None if covariance is None else A @ covariance @ A.T
             of_offset = None if of_offset is None else A @ of_offset @ R.T
+        carried = None
+        if inertial is not None and self._imu is not None:
+            carried = predicted_covariance(inertial, self._imu)
         self.odometry.move(
             T_now_last, elapsed, covariance, of_offset,
-            found_again=found_again, known_velocity=known_velocity,
+            found_again=found_again, known_velocity=known_velocity, carried=carried,
         )  # fmt: skip

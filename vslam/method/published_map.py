@@ -26,7 +26,7 @@ from vslam.method.map_frames import LandmarkCounts, MapChange, count_shared_land
 from vslam.method.shared_map import SharedMap
 from vslam.support.workers import Job, Workers
 from vslam.types.context import Context
-from vslam.types.features import FramePatches
+from vslam.types.features import FramePatches, TrackingState
 from vslam.types.frame_poses import FramePoses, FrameTable
 from vslam.types.geometry import Matrix, inverse
 from vslam.types.map import Map
@@ -213,7 +213,8 @@ class PublishedMap:
         """
         if track.near >= 0:
             self.refer_to(track.near)
-        self.frames.append(track.timestamp, track.T_cw, tracked=not track.is_lost)
+        carried = track.state == TrackingState.INERTIAL
+        self.frames.append(track.timestamp, track.T_cw, tracked=not track.is_lost, carried=carried)
 
     def count(self, track: Track) -> None:
         """Count the landmarks that a frame should have seen, and those that it found."""

@@ -22,6 +22,7 @@ from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.loopclosure.verifier import Verifier
 from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.method.closing import LoopClosing
+from vslam.method.inertia import Inertia
 from vslam.method.mapping import Mapper
 from vslam.method.modes import Building, Localising, Mode
 from vslam.method.motion import Motion
@@ -31,7 +32,8 @@ from vslam.types.camera import same_camera
 from vslam.types.context import Context
 from vslam.types.features import Extracted, TrackingState, TrackResult
 from vslam.types.frame_poses import FrameTable
-from vslam.types.geometry import inverse, orthonormalised, se3_log
+from vslam.types.geometry import Matrix, inverse, orthonormalised, se3_log
+from vslam.types.imu import ImuCalibration
 from vslam.types.map import Map
 from vslam.types.states import Checkpoint, TrackerState
 
@@ -125,6 +127,7 @@ class Session:
         *,
         localize: bool,
         resume: bool,
+        imu: ImuCalibration | None = None,
     ) -> None:
         """Begin a drive, or continue the last drive of a stored map after its last frame.
 
@@ -132,7 +135,7 @@ class Session:
         uninterrupted drive. Without a checkpoint, tracking continues from the last pose and speed.
 
         Args:
-            detector, images, start, localize, resume: see ``Slam``.
+            detector, images, start, localize, resume, imu: see ``Slam``.
             workers: threads that run the mapping jobs.
 
         Raises:
@@ -151,7 +154,7 @@ class Session:
         self._context = context
         recognise = LearnedRelocalisation(images, camera, config)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)
-        self._motion = Motion(context, self.published.frames)
+        self._motion = Motion(context, self.published.frames, imu)
         self._tracker = tracker = Tracker(context)
         self._mode: Mode = (
             Localising(self.published) if localize else Building(context, mapper, tracker)
@@ -181,6 +184,15 @@ class Session:
         # If patches failed for this frame, they will probably fail for the next frames.
         soon = self._mode.due if track.by_patches else track.index + 2
         return self._end(updated, images, clock, soon)
+
+    def add_imu(self, samples: Matrix) -> None:
+        """Add samples of the IMU (``Slam.add_imu``)."""
+        self._motion.add_samples(samples)
+
+    @property
+    def inertia(self) -> Inertia:
+        """What is known from the IMU."""
+        return self._motion.inertia
 
     def skip(self, timestamp: float, *, dropped: bool) -> TrackResult:
         """Add a frame without images at the predicted pose. Its state is LOST or DROPPED."""
@@ -276,10 +288,11 @@ class Session:
 
     def _result(self, track: Track, stage_ms: dict[str, float]) -> TrackResult:
         odometry = self._motion.odometry.state
+        T_wc = self._context.camera.as_mounted(inverse(track.T_cw))
         return TrackResult(
             index=track.index,
             timestamp=track.timestamp,
-            T_wc=self._context.camera.as_mounted(inverse(track.T_cw)),
+            T_wc=T_wc,
             state=track.state,
             n_features=0 if track.by_patches else len(track.features),
             n_stereo=track.n_stereo,
@@ -293,6 +306,7 @@ class Session:
             part=self.published.view.part,
             support=track.support,
             stands_still=track.by is By.STANDSTILL,
+            gravity=self._motion.gravity(T_wc),
         )
 
     # The state of the drive
@@ -339,6 +353,7 @@ class Session:
             self.closing.state(),
             self.rig.sides,
             self._motion.odometry.state,
+            self._motion.inertia,
         )
 
     def resume_odometry(self, last: TrackResult) -> None:
@@ -370,7 +385,7 @@ class Session:
         self._mode.restore(state.policy)
         self.closing.restore(state.closing)
         self.rig = RigMonitor(state.sides)
-        self._motion.restore(state.odometry, state.tracker.lost_frames)
+        self._motion.restore(state.odometry, state.tracker.lost_frames, state.inertia)
         last = restored_track(state.tracker, self._context)
         offset = self.published.view.disparity_offset  # it was corrected before it was saved
         extracted = replace(last.extracted, disparity_offset=offset)

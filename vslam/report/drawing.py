@@ -29,7 +29,8 @@ BLUE, GREEN, AMBER, RED, GREY = "#3b82f6", "#10b981", "#f59e0b", "#ef4444", "#94
 VIOLET = "#8b5cf6"
 COMPARED = ("#ec4899", "#f97316", "#06b6d4")  # colours of the detectors of --compare
 STATE_COLORS = {
-    TrackingState.WEAK: AMBER, TrackingState.LOST: RED, TrackingState.DROPPED: VIOLET,
+    TrackingState.WEAK: AMBER, TrackingState.INERTIAL: BLUE, TrackingState.LOST: RED,
+    TrackingState.DROPPED: VIOLET,
 }  # fmt: skip
 
 # Hex colour in the drawing -> CSS variable in the HTML report.

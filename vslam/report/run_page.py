@@ -70,8 +70,9 @@ def headlines(report: ReportJson) -> list[Tile]:
         Tile(
             "Lost frames",
             str(lost),
-            f"{share} {report.frames}{_before_map(report)}; {report.weak_frames} weak, "
-            f"{report.skipped_frames} skipped, {report.left_out_frames} left out",
+            f"{share} {report.frames}{_before_map(report)}; {_carried(report)}"
+            f"{report.weak_frames} weak, {report.skipped_frames} skipped, "
+            f"{report.left_out_frames} left out",
             "bad" if lost else "good",
         ),
         *_in_map(report),
@@ -97,6 +98,10 @@ def headlines(report: ReportJson) -> list[Tile]:
         Tile("Map", f"{report.landmarks:,}", _map_note(report)),
         _loops(report),
     ]
+
+
+def _carried(report: ReportJson) -> str:
+    return f"{count} carried by the IMU, " if (count := report.inertial_frames) else ""
 
 
 def _before_map(report: ReportJson) -> str:

@@ -120,10 +120,13 @@ class Measures(Record):
     ``loops_missed`` is the number of revisited stretches without a correct loop. Without ground
     truth, ``loops_wrong``, ``loops_found`` and ``loops_missed`` are None.
 
+    ``inertial_frames`` is the number of frames that the IMU alone carried.
+
     ``interrupted`` is the reason why the run ended early, or None if it did not end early.
     """
 
     lost_frames: int
+    inertial_frames: int = 0
     interrupted: str | None
     ate_rmse_m: float | None
     causal_ate_rmse_m: float | None = None

@@ -178,6 +178,7 @@ def _measures(
     errors = ("ate_rmse_m", "rpe_m", "rpe_deg", "t_rel_percent", "r_rel_deg_per_100m")
     return {
         "lost_frames": sum(track.state == TrackingState.LOST for track in outcome.tracks),
+        "inertial_frames": sum(track.state == TrackingState.INERTIAL for track in outcome.tracks),
         "interrupted": outcome.interrupted,
         **{name: getattr(evaluation, name, None) for name in errors},
         "causal_ate_rmse_m": causal_ate(outcome),

@@ -96,7 +96,7 @@ def _in_map(
     if scale is not None:
         T_ck[:, :3, 3] *= scale[table.reference, None]
     T_wc = inverses(T_ck @ T_kw[table.reference])
-    return bridge_gaps(Trajectory(table.timestamp, T_wc), table.tracked)
+    return bridge_gaps(Trajectory(table.timestamp, T_wc), table.known)
 
 
 def _positions(

@@ -59,7 +59,10 @@ _BLUE, _GREY = (59, 130, 246), (148, 163, 184)
 _FAINT_RED = (239, 68, 68, 80)
 _VIOLET, _PINK, _CYAN, _LIME = (139, 92, 246), (236, 72, 153), (6, 182, 212), (132, 204, 22)
 _STAGE_COLORS = (_BLUE, _AMBER, _GREEN, _VIOLET, _PINK, _CYAN, _LIME, _RED, _GREY)
-_STATE_COLORS = {TrackingState.OK: _GREEN, TrackingState.WEAK: _AMBER, TrackingState.LOST: _RED}
+_STATE_COLORS = {
+    TrackingState.OK: _GREEN, TrackingState.WEAK: _AMBER, TrackingState.INERTIAL: _BLUE,
+    TrackingState.LOST: _RED,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -258,7 +258,8 @@ def build_grid(xy, columns, rows):
 class TrackingState(StrEnum):
     """How a frame was tracked.
 
-    OK: the pose has enough inliers. WEAK: the pose has few inliers. LOST: the pose is only
+    OK: the pose has enough inliers. WEAK: the pose has few inliers. INERTIAL: the images gave no
+    pose, and the IMU has carried the camera for at most three seconds. LOST: the pose is only
     predicted, or no map exists yet. DROPPED: the images arrived while earlier images were still
     being processed (``--realtime``), so the pose is interpolated.
     """
@@ -267,6 +268,7 @@ class TrackingState(StrEnum):
     WEAK = "WEAK"
     LOST = "LOST"
     DROPPED = "DROPPED"
+    INERTIAL = "INERTIAL"  # last, because files number the states
 
 
 @dataclass(frozen=True)
@@ -300,6 +302,8 @@ class TrackResult:
             a frame that was not tracked by patches, and if hardly any landmark is known to be at
             rest, as at the start of a map.
         stands_still: whether the camera stands still.
+        gravity: ``(3,)`` acceleration of free fall in the world frame, in m/s^2. None without an
+            IMU, and until it is known. The world frame itself is never turned.
         next_extraction: index of a later frame whose features will probably be needed, so that they
             can be extracted in advance. -1 if there is no such frame.
     """
@@ -320,6 +324,7 @@ class TrackResult:
     part: int = 0
     support: float | None = None
     stands_still: bool = False
+    gravity: NDArray[np.float64] | None = None
     next_extraction: int = -1
 
     @property

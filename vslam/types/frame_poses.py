@@ -45,6 +45,7 @@ class FrameTable(NamedTuple):
         tracked: ``(N,)`` bool, False where the pose is only predicted.
         unit_scale: ``(N,)`` float64, the factor of the keyframe (``KeyframePoses.keyframe``) at the
             time when ``T_c_reference`` was measured.
+        carried: ``(N,)`` bool, True where the images gave no pose, and an IMU measured it.
     """
 
     timestamp: NDArray[np.float64]
@@ -52,6 +53,12 @@ class FrameTable(NamedTuple):
     T_c_reference: NDArray[np.float64]
     tracked: NDArray[np.bool_]
     unit_scale: NDArray[np.float64]
+    carried: NDArray[np.bool_]
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """``(N,)`` bool, True where the pose was measured by the images or by an IMU."""
+        return self.tracked | self.carried
 
     def until(self, frames: int) -> FrameTable:
         """Return the poses of the first ``frames`` frames."""
@@ -65,6 +72,7 @@ def _room_for(frames: int) -> FrameTable:
         np.zeros((frames, 4, 4)),
         np.zeros(frames, np.bool_),
         np.ones(frames),
+        np.zeros(frames, np.bool_),
     )
 
 
@@ -105,12 +113,15 @@ class FramePoses:
         """Return the timestamps of the last ``n`` frames, or of all frames if there are fewer."""
         return self._frames.timestamp[max(0, self._n - n) : self._n].copy()
 
-    def append(self, timestamp: float, T_cw: Matrix, *, tracked: bool) -> None:
+    def append(
+        self, timestamp: float, T_cw: Matrix, *, tracked: bool, carried: bool = False
+    ) -> None:
         """Append the pose of the next frame.
 
         Args:
             timestamp: seconds.
             tracked: False for a pose that is only predicted.
+            carried: whether an IMU measured a pose that is not tracked.
         """
         if self._n == len(self._frames.timestamp):
             frames, self._frames = self._frames, _room_for(self._n + self._n // 2)
@@ -118,12 +129,14 @@ class FramePoses:
         self._n += 1
         self._frames.timestamp[self._n - 1] = timestamp
         self._frames.tracked[self._n - 1] = tracked
+        self._frames.carried[self._n - 1] = carried
         self.follow(self._n - 1, self._keyframes.reference, T_cw)
 
     def replace(self, index: int, keyframe: int) -> None:
         """Set the pose of a frame that became a keyframe to the pose of that keyframe."""
         _, unit = self._keyframes.keyframe(keyframe)
         self._frames.tracked[self._number(index)] = True
+        self._frames.carried[self._number(index)] = False
         self._set(index, keyframe, np.eye(4), unit)
 
     def follow(self, index: int, keyframe: int, T_cw: Matrix) -> None:
@@ -161,10 +174,11 @@ class FramePoses:
     def trajectory(self) -> Trajectory:
         """Return the pose of every frame.
 
-        A predicted pose is replaced by an interpolation between the tracked frames before and after
-        it. Frames before the first tracked frame get the pose of the first tracked frame.
+        A predicted pose is replaced by an interpolation between the frames before and after it that
+        were tracked or carried by an IMU. Frames before the first tracked frame get the pose of the
+        first tracked frame.
         """
         frames = self._frames.until(self._n)
         poses = [inverse(self.pose(k)) for k in range(self._n)]
         T_wc = np.array(poses, np.float64).reshape(-1, 4, 4)
-        return bridge_gaps(Trajectory(frames.timestamp.copy(), T_wc), frames.tracked.copy())
+        return bridge_gaps(Trajectory(frames.timestamp.copy(), T_wc), frames.known)

@@ -9,7 +9,7 @@ Rows are sorted by time, no time is repeated, and all numbers are finite (``tidi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -205,3 +205,31 @@ class InertialState:
     gravity: Matrix
     bias: Matrix
     covariance: Matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Inertia:
+    """What is known from the IMU, between two frames.
+
+    Attributes:
+        samples: ``(N, 7)`` recent samples, see the top of this module.
+        state: the state of the IMU at the last frame, in the frame of the odometry; None if gravity
+            is not known.
+        times: ``(M,)`` seconds of the frames whose poses are collected for the start.
+        poses: ``(M, 4, 4)`` ``T_odom_camera`` of these frames.
+        carried_s: for how long the camera has been carried by the IMU alone, in seconds.
+        refused: number of poses in a row that the filter refused.
+        disagreements: how often poses and samples did not agree.
+        tried: time of the last start, in seconds.
+        known_since: time since when gravity is known, in seconds; -1 if it never was.
+    """
+
+    samples: Matrix = field(default_factory=no_samples)
+    state: InertialState | None = None
+    times: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    poses: Matrix = field(default_factory=lambda: np.empty((0, 4, 4)))
+    carried_s: float = 0.0
+    refused: int = 0
+    disagreements: int = 0
+    tried: float = -1.0
+    known_since: float = -1.0

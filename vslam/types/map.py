@@ -101,7 +101,7 @@ KEYFRAME_FIELDS = Arrays._fields[:_FIRST_OF_LANDMARKS]
 LANDMARK_FIELDS = Arrays._fields[_FIRST_OF_LANDMARKS:_FIRST_OF_ROWS]
 ROW_FIELDS = Arrays._fields[_FIRST_OF_ROWS:]
 
-PREDICTED, UNPREDICTED = 1, 2  # values of KeyframeTable.restart
+PREDICTED, UNPREDICTED, CARRIED = 1, 2, 3  # values of KeyframeTable.restart
 
 
 class KeyframeTable(NamedTuple):
@@ -119,7 +119,8 @@ class KeyframeTable(NamedTuple):
             identity while the keyframe is alive.
         restart: ``(K,)`` u1, nonzero if the keyframe is the first keyframe of a sub-map, which
             begins after the camera was lost. The value is ``PREDICTED`` if the pose of the keyframe
-            relative to its parent was predicted, and ``UNPREDICTED`` if it is unknown.
+            relative to its parent was predicted, ``UNPREDICTED`` if it is unknown, and ``CARRIED``
+            if an IMU measured it.
     """
 
     timestamp: NDArray[np.float64] = np.zeros(0)
@@ -412,14 +413,18 @@ class Map:
         detach_keyframe(a, keyframe)
         a.keyframe_alive[keyframe] = False
 
-    def begin_submap(self, keyframe: int, parent: int, *, predicted: bool) -> None:
+    def begin_submap(
+        self, keyframe: int, parent: int, *, predicted: bool, carried: bool = False
+    ) -> None:
         """Record that a keyframe begins a sub-map, and its parent in the spanning tree.
 
         Args:
             predicted: whether the pose of the keyframe relative to its parent was predicted.
+            carried: whether an IMU measured this pose.
         """
+        how = CARRIED if carried else PREDICTED if predicted else UNPREDICTED
         self.keyframes.parent[keyframe] = parent
-        self.keyframes.restart[keyframe] = PREDICTED if predicted else UNPREDICTED
+        self.keyframes.restart[keyframe] = how
 
     def submaps(self) -> NDArray[np.int64]:
         """Return the sub-map of each keyframe as an ``(n_keyframes,)`` array.

@@ -210,6 +210,7 @@ class Odometry:
         *,
         found_again: bool = False,
         known_velocity: bool = True,
+        carried: Matrix | None = None,
     ) -> None:
         """Advance to the next frame.
 
@@ -227,6 +228,8 @@ class Odometry:
                 because the camera was lost before or was relocalised.
             known_velocity: whether the velocity before the prediction was known. Otherwise, the
                 prediction is that the camera does not move.
+            carried: ``(6, 6)`` covariance of the pose since tracking was lost, if an IMU predicted
+                it. None if the pose was predicted with constant velocity.
         """
         T_odom_camera = orthonormalised(self.state.T_odom_camera @ inverse(T_now_last))
         A, now, before = adjoint(T_now_last), self.state.now, self.state.lost_s
@@ -237,7 +240,7 @@ class Odometry:
         if before >= 0.0 and (found_again or covariance is None):
             lost_s += elapsed
             speed = 0.0 if known_velocity else ANY_SPEED
-            local = _predicted(local, A, before, lost_s, speed)
+            local = _predicted(local, A, before, lost_s, speed) if carried is None else carried
         if before >= 0.0 and found_again:
             gaps, local = gaps + local, np.zeros((6, 6))
         if covariance is not None:

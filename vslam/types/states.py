@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from vslam.types.features import Features, FramePatches, KeyframePatches
 from vslam.types.geometry import Matrix
+from vslam.types.imu import Inertia
 from vslam.types.loops import LoopEdge, ResembledPlace
 from vslam.types.odometry import OdometryState
 
@@ -197,3 +198,4 @@ class Checkpoint:
     closing: ClosingState
     sides: ComparedSides = field(default_factory=ComparedSides)
     odometry: OdometryState = field(default_factory=OdometryState)
+    inertia: Inertia = field(default_factory=Inertia)

@@ -1,0 +1,184 @@
+"""A walk with an IMU: through the dark, without samples, with late ones, and after a checkpoint."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from conftest import corridor_mipmaps, render
+from inertial import ADIS16448, Walk, seen_by
+
+from vslam.method.inertia import IMU_REFUSED, with_samples
+from vslam.slam import Slam
+from vslam.types.camera import Camera
+from vslam.types.features import TrackingState
+from vslam.types.geometry import inverse, se3_exp, se3_log
+from vslam.types.imu import GRAVITY, ImuCalibration, Inertia
+
+CAMERA = Camera(240.0, 240.0, 239.5, 79.5, 0.3, 480, 160)
+T_IMU_CAMERA = se3_exp(np.array([0.05, -0.02, 0.1, 0.2, 1.0, -1.5]))
+CALIBRATION = ImuCalibration(T_IMU_CAMERA, ADIS16448)
+BIAS = np.array([0.01, -0.02, 0.05, 0.05, -0.1, 0.08])
+WALK = Walk(1)
+LAST = 60
+TIMES = 0.05 * np.arange(LAST)
+DARK = range(30, 50)  # 1 s
+TRUTH = [inverse(WALK.pose(0.0)) @ WALK.pose(t) for t in TIMES]
+
+
+@cache
+def images() -> list[tuple[np.ndarray, np.ndarray]]:
+    mipmaps, T_left_right = corridor_mipmaps(), np.eye(4)
+    T_left_right[0, 3] = CAMERA.baseline
+    poses = [WALK.pose(t) for t in TIMES]
+    return [(render(mipmaps, CAMERA, T), render(mipmaps, CAMERA, T @ T_left_right)) for T in poses]
+
+
+@cache
+def samples() -> np.ndarray:
+    times = np.arange(-0.05, TIMES[-1] + 0.05, 0.005)
+    rows = seen_by(WALK.samples(times), T_IMU_CAMERA, WALK)
+    rng = np.random.default_rng(5)
+    noise = np.repeat([ADIS16448.gyro, ADIS16448.accel], 3) / np.sqrt(0.005)
+    rows[:, 1:] += BIAS + noise * rng.standard_normal((len(times), 6))
+    return rows
+
+
+def walk(slam, imu, *, dark=(), first=0, last=LAST) -> list:
+    """Track the walk. ``imu`` are the samples that are passed, or None."""
+    results = []
+    for k in range(first, last):
+        left, right = images()[k]
+        if k in dark:
+            left, right = np.zeros_like(left), np.zeros_like(right)
+        rows = None
+        if imu is not None:
+            after = TIMES[k - 1] if k > first else -1.0 if first == 0 else TIMES[first - 1]
+            rows = imu[(imu[:, 0] > after) & (imu[:, 0] <= TIMES[k])]
+        results.append(slam.step(left, right, TIMES[k], imu=rows))
+    return results
+
+
+def slam_with(calibration=CALIBRATION, **options) -> Slam:
+    return Slam(CAMERA, imu=calibration, detector="none", threads=1, **options)
+
+
+def error(result) -> tuple[float, float]:
+    """Return the error of a pose at the time of tracking, in metres and degrees."""
+    apart = se3_log(inverse(TRUTH[result.index]) @ result.T_wc)
+    return float(np.linalg.norm(apart[:3])), float(np.degrees(np.linalg.norm(apart[3:])))
+
+
+def test_the_imu_carries_the_camera_through_a_second_of_darkness():
+    carried, alone = slam_with(), slam_with(None)
+    results, without = walk(carried, samples(), dark=DARK), walk(alone, None, dark=DARK)
+    states = [result.state for result in results]
+    assert {states[k] for k in DARK} == {TrackingState.INERTIAL}
+    assert {without[k].state for k in DARK} == {TrackingState.LOST}
+    assert all(states[k] == TrackingState.OK for k in range(len(TIMES)) if k not in DARK)
+
+    metres, degrees = error(results[DARK[-1]])
+    metres_without, degrees_without = error(without[DARK[-1]])
+    assert metres < 0.06
+    assert degrees < 0.1
+    assert metres < 0.5 * metres_without
+    assert degrees < 0.1 * degrees_without
+
+    for slam in (carried, alone):
+        slam.finish()
+    assert carried.gaps() == []
+    there = carried.trajectory().T_wc[DARK]
+    apart = np.linalg.norm(there[:, :3, 3] - [TRUTH[k][:3, 3] for k in DARK], axis=1)
+    assert apart.max() < 0.06  # the trajectory keeps what the IMU measured
+
+
+def test_the_uncertainty_grows_in_the_dark_and_is_that_of_the_error():
+    results = walk(slam_with(), samples(), dark=DARK)
+    sizes = [np.trace(results[k].uncertainty.local[:3, :3]) for k in (DARK[0], DARK[-1])]
+    assert sizes[1] > 10.0 * sizes[0]
+    end = results[DARK[-1]]
+    apart = se3_log(inverse(end.T_wc) @ TRUTH[end.index])  # exp(-xi) in the frame of the camera
+    assert apart @ np.linalg.solve(end.uncertainty.local, apart) < 22.5  # 0.001 of 6 degrees
+
+
+def test_gravity_is_known_after_half_a_second_and_the_world_is_not_turned():
+    results = walk(slam_with(), samples())
+    known = [result for result in results if result.gravity is not None]
+    assert known[0].timestamp <= 0.8
+    down = WALK.rotation(0.0).T @ np.array([0.0, GRAVITY, 0.0])
+    for result in known:
+        cosine = result.gravity @ down / GRAVITY**2
+        assert np.degrees(np.arccos(min(cosine, 1.0))) < 1.5
+    assert np.array_equal(results[0].T_wc, np.eye(4))
+    assert max(error(result)[0] for result in results) < 0.02
+
+
+def test_an_imu_is_never_worse_in_the_light():
+    with_imu, without = slam_with(), slam_with(None)
+    one, other = walk(with_imu, samples()), walk(without, None)
+    assert error(one[-1])[0] < error(other[-1])[0] + 0.002
+
+
+def test_samples_without_a_calibration_change_nothing():
+    one, other = slam_with(None), slam_with(None)
+    walk(one, samples(), last=20)
+    walk(other, None, last=20)
+    assert one.trajectory().T_wc.tobytes() == other.trajectory().T_wc.tobytes()
+
+
+def test_late_and_repeated_samples_give_the_same_bytes_and_missing_ones_do_no_harm():
+    rng, rows = np.random.default_rng(0), samples()
+    sound, mixed, holed = slam_with(), slam_with(), slam_with()
+    walk(sound, rows, dark=DARK)
+    after = -1.0
+    for k, t in enumerate(TIMES):
+        left, right = images()[k]
+        new = rows[(rows[:, 0] > after) & (rows[:, 0] <= t)]
+        after = t
+        mixed.add_imu(rng.permutation(np.concatenate([new, new[:3]])))
+        light = np.uint8(k not in DARK)
+        mixed.step(light * left, light * right, t)
+    assert mixed.trajectory().T_wc.tobytes() == sound.trajectory().T_wc.tobytes()
+
+    hole = (rows[:, 0] > 1.6) & (rows[:, 0] < 1.9)  # in the dark
+    results = walk(holed, rows[~hole], dark=DARK)
+    assert TrackingState.LOST in {results[k].state for k in DARK}
+    assert results[-1].state == TrackingState.OK
+    assert error(results[-1])[0] < 0.03
+
+
+def test_a_mount_that_contradicts_the_images_is_refused_in_one_sentence():
+    inverted = ImuCalibration(inverse(T_IMU_CAMERA), ADIS16448)
+    slam = slam_with(inverted)
+    results = walk(slam, samples())
+    assert slam.problems == [IMU_REFUSED]
+    assert results[-1].gravity is None
+    assert max(error(result)[0] for result in results) < 0.02
+    assert slam_with().problems == []
+
+
+def test_a_resumed_walk_gives_the_same_bytes(tmp_path):
+    whole = slam_with()
+    walk(whole, samples(), dark=DARK)
+    first, at = slam_with(), 25
+    walk(first, samples(), last=at)
+    first.finish()
+    first.save(tmp_path / "map.npz", resumable=True)
+    second = Slam.load(tmp_path / "map.npz", resume=True, threads=1, imu=CALIBRATION)
+    walk(second, samples(), dark=DARK, first=at)
+    for slam in (whole, second):
+        slam.finish()
+    states = whole._session.inertia, second._session.inertia
+    assert np.allclose(states[0].state.T_world_imu, states[1].state.T_world_imu, atol=1e-3)
+    assert np.abs(whole.trajectory().T_wc - second.trajectory().T_wc).max() < 5e-3
+
+
+def test_old_samples_are_forgotten():
+    inertia = Inertia()
+    for start in range(20):
+        rows = np.zeros((200, 7))
+        rows[:, 0] = start + 0.005 * np.arange(200)
+        inertia = with_samples(inertia, rows)
+    assert len(inertia.samples) < 450
+    assert inertia.samples[-1, 0] == pytest.approx(19.995)

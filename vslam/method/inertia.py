@@ -1,0 +1,206 @@
+"""What is known about the motion of the camera from its IMU.
+
+The state of the IMU is followed in the world frame of the odometry, which never jumps. Loops and
+relocalisation move the pose of the camera in the map, but they do not change how fast the camera
+moves, or where down is.
+
+First, the poses of a short stretch of tracked frames are collected, until they give gravity, the
+velocity and the biases (``backend/inertial_start.py``). From then on, a filter follows them
+(``backend/inertial_filter.py``). Samples predict the pose of the next frame, and the tracked pose
+corrects the state. A camera that is lost is carried on by the samples alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vslam.backend.inertial_filter import (
+    anchored,
+    camera_covariance,
+    camera_pose,
+    corrected_by_pose,
+    corrected_by_rest,
+    propagated,
+)
+from vslam.backend.inertial_start import MAX_MISFIT, PoseStretch, find_gravity
+from vslam.types.geometry import Matrix, inverse
+from vslam.types.imu import ImuCalibration, Inertia, InertialState, tidied
+
+CARRIED_S = 3.0  # s without images after which a pose counts as lost, not as carried by the IMU
+# A gap between samples above which they do not tell the motion, in seconds.
+LONGEST_GAP = 0.1
+# The start needs poses over START_S seconds. It is tried again every RETRY_S seconds, with the
+# poses of the last STRETCH_S seconds, of which at most MOST_POSES are used.
+START_S, RETRY_S, STRETCH_S, MOST_POSES = 0.5, 0.25, 1.0, 20
+KEPT_S = 2.0  # s for which samples are kept
+# Standard deviations of poses by images at the start, along each axis: metres and radians. Errors
+# of the covariances that the images give are not independent from frame to frame, so those
+# covariances are multiplied by POSE_INFLATION, and are at least as large as these.
+SIGMA_M, SIGMA_RAD = 0.002, 0.0005
+POSE_INFLATION = 4.0
+REST_SIGMA = 0.01  # m/s, standard deviation of the velocity of a camera that stands still
+# A pose with a larger squared distance from its prediction is not used: 0.001 of six degrees of
+# freedom. After so many such poses in a row, the state is found anew.
+IMPLAUSIBLE, MOST_REFUSED = 22.5, 5
+# After so many disagreements, the IMU is not used. A disagreement is a start at which poses and
+# samples did not agree, or a state that had to be found anew. They are forgotten if a state has
+# agreed with the poses for AGREED_S seconds.
+MOST_DISAGREEMENTS, AGREED_S = 5, 3.0
+IMU_REFUSED = (
+    "The IMU is not used, because its samples contradict the motion in the images: check "
+    "T_imu_camera (it maps points of the left camera to the IMU), its time_offset, and the units "
+    "rad/s and m/s^2."
+)
+
+
+def is_refused(inertia: Inertia) -> bool:
+    """Return whether the IMU is not used, because it contradicts the images."""
+    return inertia.disagreements >= MOST_DISAGREEMENTS
+
+
+def with_samples(inertia: Inertia, samples: Matrix) -> Inertia:
+    """Add ``(N, 7)`` samples, which may be late or repeated. Old samples are forgotten.
+
+    Raises:
+        ValueError: the shape is not ``(N, 7)``.
+    """
+    known = tidied(np.concatenate([inertia.samples, tidied(samples).samples])).samples
+    if len(known):
+        since = known[-1, 0] - KEPT_S
+        if inertia.state is not None:
+            since = min(since, inertia.state.timestamp)
+        known = known[max(int(np.searchsorted(known[:, 0], since)) - 1, 0) :]
+    return replace(inertia, samples=known)
+
+
+def predicted_state(
+    inertia: Inertia, timestamp: float, calibration: ImuCalibration
+) -> InertialState | None:
+    """Return the state at the time of the next frame; None if it is unknown."""
+    state, times = inertia.state, inertia.samples[:, 0]
+    if state is None or not len(times) or not timestamp > state.timestamp:
+        return None
+    first = max(int(np.searchsorted(times, state.timestamp, "right")) - 1, 0)
+    last = int(np.searchsorted(times, timestamp)) + 1
+    known = np.concatenate([[state.timestamp], times[first:last], [timestamp]])
+    if np.diff(np.sort(known)).max() > LONGEST_GAP:
+        return None
+    return propagated(state, inertia.samples, timestamp, calibration.noise)
+
+
+def tracked(
+    inertia: Inertia,
+    predicted: InertialState | None,
+    timestamp: float,
+    T_odom_camera: Matrix,
+    covariance: Matrix,
+    calibration: ImuCalibration,
+    *,
+    stands_still: bool,
+) -> Inertia:
+    """Return what is known after a frame that was tracked from the frame before.
+
+    Args:
+        predicted: the state that was predicted for this frame.
+        T_odom_camera: ``(4, 4)`` pose of the frame.
+        covariance: ``(6, 6)`` of this pose (``PoseUncertainty.local``).
+    """
+    inertia = replace(inertia, carried_s=0.0)
+    if is_refused(inertia):
+        return inertia
+    if predicted is None:  # unknown, or samples are missing
+        return _started(_collected(inertia, timestamp, T_odom_camera), calibration)
+    floor = np.repeat([SIGMA_M**2, SIGMA_RAD**2], 3)
+    noise = POSE_INFLATION * covariance + np.diag(floor)
+    found = corrected_by_pose(predicted, T_odom_camera, noise, calibration.T_imu_camera)
+    if not found.chi2 <= IMPLAUSIBLE:
+        if inertia.refused + 1 >= MOST_REFUSED:
+            n = inertia.disagreements + 1
+            return replace(_forgotten(inertia), refused=0, disagreements=n)
+        return replace(inertia, state=predicted, refused=inertia.refused + 1)
+    state = found.state
+    if stands_still:
+        state = corrected_by_rest(state, REST_SIGMA).state
+    agreed = timestamp - inertia.tried > AGREED_S
+    n = 0 if agreed else inertia.disagreements
+    return replace(inertia, state=state, refused=0, disagreements=n)
+
+
+def found_again(
+    inertia: Inertia,
+    predicted: InertialState | None,
+    T_odom_camera: Matrix,
+    calibration: ImuCalibration,
+) -> Inertia:
+    """Return what is known after a frame that was found in the map again.
+
+    The odometry continues from the predicted pose, so its frame is defined anew by this pose.
+    """
+    if predicted is None:
+        return replace(_forgotten(inertia), carried_s=0.0)
+    T_odom_imu = T_odom_camera @ inverse(calibration.T_imu_camera)
+    return replace(inertia, state=anchored(predicted, T_odom_imu), carried_s=0.0, refused=0)
+
+
+def lost(inertia: Inertia, predicted: InertialState | None, seconds: float) -> Inertia:
+    """Return what is known after a frame that was not tracked.
+
+    Args:
+        seconds: time since the frame before.
+    """
+    if predicted is None:
+        return _forgotten(inertia)
+    return replace(inertia, state=predicted, carried_s=inertia.carried_s + seconds)
+
+
+def predicted_motion(
+    predicted: InertialState, T_odom_camera: Matrix, calibration: ImuCalibration
+) -> Matrix:
+    """Return the ``(4, 4)`` motion that maps points from the camera of the last frame to the camera
+    of the next frame.
+
+    Args:
+        T_odom_camera: ``(4, 4)`` pose of the last frame.
+    """
+    return inverse(camera_pose(predicted, calibration.T_imu_camera)) @ T_odom_camera
+
+
+def predicted_covariance(predicted: InertialState, calibration: ImuCalibration) -> Matrix:
+    """Return the ``(6, 6)`` covariance of a predicted pose (``PoseUncertainty.local``)."""
+    return camera_covariance(predicted, calibration.T_imu_camera)
+
+
+def _forgotten(inertia: Inertia) -> Inertia:
+    """Return what is left if the state is unknown."""
+    nothing = Inertia()
+    return replace(inertia, state=None, times=nothing.times, poses=nothing.poses)
+
+
+def _collected(inertia: Inertia, timestamp: float, T_odom_camera: Matrix) -> Inertia:
+    """Add a pose to the stretch for the start."""
+    times = np.append(inertia.times, timestamp)
+    poses = np.concatenate([inertia.poses, T_odom_camera[None]])
+    recent = times >= timestamp - STRETCH_S
+    return replace(inertia, state=None, times=times[recent], poses=poses[recent])
+
+
+def _started(inertia: Inertia, calibration: ImuCalibration) -> Inertia:
+    """Try to find the state from the stretch."""
+    times = inertia.times
+    now = float(times[-1])
+    if now - times[0] < START_S or now - inertia.tried < RETRY_S:
+        return inertia
+    inertia = replace(inertia, tried=now)
+    step = -(-len(times) // MOST_POSES)
+    chosen = slice((len(times) - 1) % step, None, step)  # the newest pose belongs to them
+    stretch = PoseStretch(times[chosen], inertia.poses[chosen], SIGMA_M, SIGMA_RAD)
+    found = find_gravity(stretch, inertia.samples, calibration, known_scale=True)
+    if found is None:
+        return inertia
+    if found.doubt:
+        n = inertia.disagreements + (found.misfit > MAX_MISFIT)
+        return replace(inertia, disagreements=n)
+    since = now if inertia.known_since < 0.0 else inertia.known_since
+    return replace(_forgotten(inertia), state=found.state, refused=0, known_since=since)

@@ -14,11 +14,14 @@ from scipy.spatial.transform import Rotation
 from vslam.datasets import open_sequence
 from vslam.datasets.association import poses_at
 from vslam.datasets.euroc import _pair, open_euroc, open_raw_euroc
+from vslam.datasets.imu import ImuFeed
 from vslam.datasets.perturbation import Perturbation
 from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.slam import Slam
 from vslam.support.errors import InputError, UnreadableImageError
+from vslam.types.features import TrackingState
 from vslam.types.geometry import se3_exp
 from vslam.types.trajectory import Trajectory
 
@@ -277,6 +280,26 @@ def test_missing_data_and_images(root):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not REAL.is_dir(), reason="EuRoC clip absent")
+def test_the_real_vehicle_stands_still_through_the_dark_by_its_imu():
+    """At rest, the IMU starts without motion, and a second without images moves nothing."""
+    sequence = open_euroc(REAL, "", max_frames=60)
+    assert sequence.imu is not None
+    rest, camera = ImuFeed(sequence.imu), sequence.camera
+    slam = Slam(camera, detector="none", threads=1, imu=sequence.imu.calibration)
+    results = []
+    for k, frame in enumerate(sequence.frames()):
+        left, right = frame.read(map)
+        light = np.uint8(not 35 <= k < 55)
+        samples = rest.until(frame.timestamp)
+        results.append(slam.step(light * left, light * right, frame.timestamp, imu=samples))
+    slam.finish()
+    assert {result.state for result in results[35:55]} == {TrackingState.INERTIAL}
+    moved = [np.linalg.norm(result.T_wc[:3, 3]) for result in results]
+    assert max(moved) < 0.05
+    assert np.linalg.norm(results[-1].gravity) == pytest.approx(9.81)
+
+
 @pytest.mark.skipif(not REAL.is_dir(), reason="EuRoC clip absent")
 def test_the_real_vehicle_stands_still():
     sequence = open_euroc(REAL, "", start=21, max_frames=25)

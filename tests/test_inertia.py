@@ -182,3 +182,32 @@ def test_old_samples_are_forgotten():
         inertia = with_samples(inertia, rows)
     assert len(inertia.samples) < 450
     assert inertia.samples[-1, 0] == pytest.approx(19.995)
+
+
+@cache
+def unseen() -> list[tuple[np.ndarray, np.ndarray]]:
+    """The images after the dark, in a corridor with other textures."""
+    mipmaps, T_left_right = corridor_mipmaps(8), np.eye(4)
+    T_left_right[0, 3] = CAMERA.baseline
+    poses = [WALK.pose(t) for t in TIMES[DARK.stop :]]
+    return [(render(mipmaps, CAMERA, T), render(mipmaps, CAMERA, T @ T_left_right)) for T in poses]
+
+
+@pytest.mark.parametrize("imu", [CALIBRATION, None])
+def test_what_is_seen_first_after_the_dark_joins_the_map_only_with_an_imu(imu):
+    slam = slam_with(imu)
+    walk(slam, None if imu is None else samples(), dark=DARK, last=DARK.stop)
+    results = []
+    for k, (left, right) in enumerate(unseen(), DARK.stop):
+        rows = samples()[(samples()[:, 0] > TIMES[k - 1]) & (samples()[:, 0] <= TIMES[k])]
+        results.append(slam.step(left, right, TIMES[k], imu=None if imu is None else rows))
+    slam.finish()
+    assert results[-1].state == TrackingState.OK
+    if imu is None:
+        assert len(slam.gaps()) == 1
+        assert not slam.in_map()[-1]
+        return
+    assert slam.gaps() == []
+    assert slam.in_map()[-1]
+    assert results[-1].part == 0
+    assert error(results[-1])[0] < 0.1

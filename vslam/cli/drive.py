@@ -65,14 +65,15 @@ def drive(
     from vslam.report.folder import write_results
     from vslam.run.autosave import MAP, FolderAutosave, remove_autosave
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
-    from vslam.run.pipeline import begin, run_sequence
+    from vslam.run.pipeline import begin, imu_of, run_sequence
 
     effective = {"perturb": perturbation.name, "realtime": options.realtime or source.live}
     settings = options.model_copy(update=effective)
     with ExitStack() as lock:
         unfinished = _unfinished(options, source, resume, lock)
         _compile(settings, console)
-        slam = begin(source.camera, settings, None if unfinished is None else unfinished.map)
+        saved = None if unfinished is None else unfinished.map
+        slam = begin(source.camera, settings, saved, imu_of(source))
         viewer = _viewer(output, console)
         if unfinished is not None:
             console.announce(f"continuing at frame {len(unfinished.progress.tracks)} ...")

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.frames import Source, TimedFrame
+from vslam.datasets.imu import ImuFeed
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.datasets.times import jitter_warnings
 from vslam.loopclosure.registry import detector_with_images, problem_of
@@ -42,6 +43,8 @@ from vslam.support.machine import give_back_memory, peak_memory_mb, process_age
 from vslam.support.plugins import reason
 from vslam.types.camera import Camera, same_camera
 from vslam.types.features import TrackingState, TrackResult
+from vslam.types.geometry import Matrix
+from vslam.types.imu import ImuCalibration
 from vslam.types.loops import LoopCorrection, LoopEdge
 from vslam.types.map import Map
 from vslam.types.trajectory import Trajectory
@@ -85,10 +88,12 @@ def run_sequence(
             the run early.
     """
     cv2.setNumThreads(1)  # the thread pool already uses all cores
-    slam = slam or begin(sequence.camera, settings, None if resume is None else resume.map)
+    imu, saved = imu_of(sequence), None if resume is None else resume.map
+    feed = None if sequence.imu is None or imu is None else ImuFeed(sequence.imu)
+    slam = slam or begin(sequence.camera, settings, saved, imu)
     perturbation = perturbation.bound_to(sequence)
     pair = PairCheck(sequence.camera, sequence.dataset, settings)
-    others = [] if resume is not None else _compared(sequence.camera, settings, pair)
+    others = [] if resume is not None else _compared(sequence.camera, settings, pair, imu)
     recorder.begin(sequence.camera, ground_truth_of(sequence))
     main = _Run(slam, settings, Progress() if resume is None else resume.progress, pair)
     n_recorded = 0  # loops passed to the recorder so far
@@ -107,7 +112,8 @@ def run_sequence(
         )
         try:
             for played in ahead:
-                result = main.step(played)
+                samples = None if feed is None else feed.until(played.timestamp)
+                result = main.step(played, samples)
                 ahead.request(result.next_extraction)
                 if (frame := played.prepared) is not None and frame.problem and not frame.dropped:
                     _log.warning("frame %d skipped: %s", result.index, frame.problem)
@@ -119,7 +125,7 @@ def run_sequence(
                 for other in others:
                     if other.problem is None:
                         with other.recording_failure(f"frame {result.index}"):
-                            other.step(played)
+                            other.step(played, samples)
                 if main.problem:
                     break
                 if interrupted.is_set():
@@ -152,11 +158,13 @@ def run_sequence(
     return replace(_outcome(sequence, main, seconds, end_reason), compared=compared)
 
 
-def _compared(camera: Camera, settings: RunOptions, pair: PairCheck) -> list[_Run]:
+def _compared(
+    camera: Camera, settings: RunOptions, pair: PairCheck, imu: ImuCalibration | None
+) -> list[_Run]:
     """Begin a run for each loop detector in ``settings.compare``, with its shipped weights."""
     common: dict[str, object] = {"weights": None, "compare": ()}
     each = [settings.model_copy(update={**common, "detector": name}) for name in settings.compare]
-    return [_Run(begin(camera, one), one, Progress(), pair) for one in each]
+    return [_Run(begin(camera, one, None, imu), one, Progress(), pair) for one in each]
 
 
 class _Run:
@@ -222,9 +230,15 @@ class _Run:
         # A step that failed may have added a pose without a result.
         return self.slam.trajectory().select(np.arange(len(self.tracks)))
 
-    def step(self, played: Played[PreparedFrame]) -> TrackResult:
-        """Track a prepared frame. A frame that was dropped or cannot be read is skipped."""
+    def step(self, played: Played[PreparedFrame], samples: Matrix | None) -> TrackResult:
+        """Track a prepared frame. A frame that was dropped or cannot be read is skipped.
+
+        Args:
+            samples: ``(N, 7)`` samples of the IMU since the frame before; None without an IMU.
+        """
         start = time.perf_counter()
+        if samples is not None:
+            self.slam.add_imu(samples)
         timestamp, frame = played.timestamp, played.prepared
         if frame is None or frame.dropped:
             result = self.slam.skip(timestamp, dropped=True)
@@ -444,11 +458,22 @@ def _with_earlier(
     return loops + slam.loops, corrections + slam.corrections, np.concatenate([frames, extra])
 
 
-def begin(camera: Camera, settings: RunOptions, saved: Path | None = None) -> Slam:
+def imu_of(sequence: Source) -> ImuCalibration | None:
+    """Return the calibration of the IMU that a run uses; None if it uses none."""
+    return None if sequence.imu is None else sequence.imu.calibration
+
+
+def begin(
+    camera: Camera,
+    settings: RunOptions,
+    saved: Path | None = None,
+    imu: ImuCalibration | None = None,
+) -> Slam:
     """Create the ``Slam`` of a run with a new map or with the map in ``settings.map_file``.
 
     Args:
         saved: the map file of an interrupted run, which is continued instead.
+        imu: the IMU on the left camera; None if there is none.
 
     Raises:
         InputError: the map does not exist, the map was made with a different camera, detector or
@@ -461,11 +486,15 @@ def begin(camera: Camera, settings: RunOptions, saved: Path | None = None) -> Sl
         local_weights=settings.local_weights, late=late,
     )  # fmt: skip
     if saved is not None:
-        return Slam.load(saved, config, detector, threads=threads, images=images, resume=True)
+        return Slam.load(
+            saved, config, detector, threads=threads, images=images, resume=True, imu=imu
+        )
     map_file, localize = settings.map_file, settings.localize
     if map_file is None:
-        return Slam(camera, config, detector, threads=threads, images=images)
-    return Slam.load(map_file, config, detector, threads=threads, images=images, localize=localize)
+        return Slam(camera, config, detector, threads=threads, images=images, imu=imu)
+    return Slam.load(
+        map_file, config, detector, threads=threads, images=images, localize=localize, imu=imu
+    )
 
 
 def require_camera(map_file: Path, camera: Camera) -> None:

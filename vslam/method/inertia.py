@@ -32,9 +32,11 @@ CARRIED_S = 3.0  # s without images after which a pose counts as lost, not as ca
 # A gap between samples above which they do not tell the motion, in seconds.
 LONGEST_GAP = 0.1
 # The start needs poses over START_S seconds. It is tried again every RETRY_S seconds, with the
-# poses of the last STRETCH_S seconds, of which at most MOST_POSES are used.
+# poses of the last STRETCH_S seconds, of which at most MOST_POSES are used. Of a slow camera, the
+# last FEWEST_POSES poses are used, if they are at most LONGEST_S seconds old.
 START_S, RETRY_S, STRETCH_S, MOST_POSES = 0.5, 0.25, 1.0, 20
-KEPT_S = 2.0  # s for which samples are kept
+FEWEST_POSES, LONGEST_S = 6, 2.5
+KEPT_S = 3.0  # s for which samples are kept
 # Standard deviations of poses by images at the start, along each axis: metres and radians. Errors
 # of the covariances that the images give are not independent from frame to frame, so those
 # covariances are multiplied by POSE_INFLATION, and are at least as large as these.
@@ -182,7 +184,8 @@ def _collected(inertia: Inertia, timestamp: float, T_odom_camera: Matrix) -> Ine
     """Add a pose to the stretch for the start."""
     times = np.append(inertia.times, timestamp)
     poses = np.concatenate([inertia.poses, T_odom_camera[None]])
-    recent = times >= timestamp - STRETCH_S
+    newest = np.arange(len(times)) >= len(times) - FEWEST_POSES
+    recent = (times >= timestamp - STRETCH_S) | (newest & (times >= timestamp - LONGEST_S))
     return replace(inertia, state=None, times=times[recent], poses=poses[recent])
 
 

@@ -270,8 +270,8 @@ class Motion:
             T_now_last = T @ T_now_last @ T.T
             covariance = None if covariance is None else A @ covariance @ A.T
             of_offset = None if of_offset is None else A @ of_offset @ R.T
-        carried = None
-        if inertial is not None and self._imu is not None:
+        carried, is_predicted = None, covariance is None or found_again
+        if is_predicted and inertial is not None and self._imu is not None:
             carried = predicted_covariance(inertial, self._imu)
         self.odometry.move(
             T_now_last, elapsed, covariance, of_offset,

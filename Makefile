@@ -55,7 +55,7 @@ figures-check: $(INSTALLED)  ## check that each has a stamp; list those of anoth
 	$(BIN)/python tools/figures.py --check
 
 method: $(DEVELOPED)  ## write the trajectories that METHOD_VERSION stands for
-	WRITE_METHOD_REFERENCES=1 $(BIN)/python -m pytest -q tests/test_method_version.py
+	WRITE_METHOD_REFERENCES=1 $(BIN)/python -m pytest -q tests/product/test_method_version.py
 
 clean:  ## remove build products and caches (.venv, data and runs stay)
 	rm -rf build dist vslam.egg-info .mypy_cache .pytest_cache .ruff_cache

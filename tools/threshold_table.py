@@ -26,7 +26,7 @@ DESCRIPTION = re.compile(
 )
 HEAD = """# Thresholds
 
-This page lists all thresholds of vslam. `python tools/threshold_table.py` generates it from `vslam/config.py`, and `tests/test_threshold_table.py` checks that the two agree. [The design](../explanation/design.md) describes the methods in which the thresholds are used. There are four ways to change thresholds:
+This page lists all thresholds of vslam. `python tools/threshold_table.py` generates it from `vslam/config.py`, and `tests/project/test_threshold_table.py` checks that the two agree. [The design](../explanation/design.md) describes the methods in which the thresholds are used. There are four ways to change thresholds:
 
 - In a JSON file: `vslam run --config FILE`, with `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}` in the file.
 - On the command line: `vslam run --config orb.n_features=1500,tracking.method=patches`.

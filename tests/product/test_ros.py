@@ -1,0 +1,341 @@
+"""Runs as ROS 2 messages, read by Foxglove's library, and the conversions of the example."""
+
+from __future__ import annotations
+
+import math
+import runpy
+import shutil
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from scipy.spatial.transform import Rotation
+from test_pipeline import run as run_pipeline
+from typer.testing import CliRunner
+
+from vslam.cli.main import every_command
+from vslam.maps.ros import (
+    T_BASE_OPTICAL,
+    TOPICS,
+    FramePose,
+    in_ros_axes,
+    nanoseconds,
+    odometry_message,
+)
+from vslam.maps.storage import load_map
+from vslam.report.folder import write_results
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera
+from vslam.types.features import TrackingState, TrackResult
+from vslam.types.geometry import inverse, se3_exp
+from vslam.types.odometry import PoseUncertainty
+from vslam.types.trajectory import read_trajectory
+
+ROOT = Path(__file__).parents[2]
+TRANSIENT_LOCAL = 1  # value in rmw's enum rmw_qos_durability_policy_t
+AHEAD = se3_exp(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+RIGHT_TURN = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.0]))
+
+
+@pytest.fixture(scope="module")
+def folder(kitti_tree, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("ros")
+    write_results(folder, run_pipeline(kitti_tree), pages=False)
+    return folder
+
+
+def export(*words: object) -> str:
+    done = CliRunner().invoke(every_command(), ["export", "ros", *map(str, words)])
+    if done.exception is not None:
+        raise done.exception
+    return done.output
+
+
+def types_of_ros():
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY).types.__getitem__
+
+
+def read(path: Path) -> dict[str, list]:
+    """Return the messages of each topic, with the times at which they were written."""
+    found: dict[str, list] = {}
+    with path.open("rb") as file:
+        bag = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        assert bag.get_header().profile == "ros2"
+        for schema, channel, record, message in bag.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append((record.log_time, message))
+            name, latched = TOPICS[channel.topic]
+            assert (schema.name, schema.encoding) == (name, "ros2msg")
+            assert channel.message_encoding == "cdr"
+            profiles = yaml.safe_load(channel.metadata["offered_qos_profiles"]) or []
+            assert [qos["durability"] for qos in profiles] == [TRANSIENT_LOCAL] * latched
+    return found
+
+
+def matrix(translation, rotation) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat([rotation.x, rotation.y, rotation.z, rotation.w]).as_matrix()
+    T[:3, 3] = translation.x, translation.y, translation.z
+    return T
+
+
+def of_transform(stamped) -> np.ndarray:
+    return matrix(stamped.transform.translation, stamped.transform.rotation)
+
+
+def of_pose(pose) -> np.ndarray:
+    return matrix(pose.position, pose.orientation)
+
+
+def stamp(header) -> int:
+    return header.stamp.sec * 10**9 + header.stamp.nanosec
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("online", [False, True])
+def test_a_bag_says_what_the_files_of_the_run_say(folder, tmp_path, online):
+    said = export(folder, "--out", tmp_path / "run.mcap", *["--online"] * online)
+    assert said.startswith(f"{tmp_path / 'run.mcap'}: 28 poses, ")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+    bag = read(tmp_path / "run.mcap")
+    name = "trajectory_causal.tum" if online else "trajectory.tum"
+    in_map = read_trajectory(folder / name)
+    odometry = read_trajectory(folder / "trajectory_odom.tum")
+    assert {topic: len(messages) for topic, messages in bag.items()} == {
+        "/tf_static": 1, "/map_points": 1, "/path": 1, "/tf": 28, "/odom": 28,
+    }  # fmt: skip
+
+    ((_, static),) = bag["/tf_static"]
+    (fixed,) = static.transforms
+    assert (fixed.header.frame_id, fixed.child_frame_id) == ("base_link", "camera_optical")
+    # The pose of the camera in the map, computed along the tree of frames.
+    for k, (time, tf) in enumerate(bag["/tf"]):
+        names = [(one.header.frame_id, one.child_frame_id) for one in tf.transforms]
+        assert names == [("map", "odom"), ("odom", "base_link")]
+        assert time == stamp(tf.transforms[0].header) == round(1e9 * in_map.timestamps[k])
+        T_map_odom, T_odom_base = map(of_transform, tf.transforms)
+        T_map_optical = T_map_odom @ T_odom_base @ of_transform(fixed)
+        wanted = T_BASE_OPTICAL @ in_map.T_wc[k]
+        np.testing.assert_allclose(T_map_optical, wanted, atol=1e-7)
+        message = bag["/odom"][k][1]
+        assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_link")
+        np.testing.assert_allclose(of_pose(message.pose.pose), T_odom_base, atol=1e-9)
+        np.testing.assert_allclose(
+            T_odom_base @ of_transform(fixed), T_BASE_OPTICAL @ odometry.T_wc[k], atol=1e-7
+        )
+    ((_, path),) = bag["/path"]
+    assert path.header.frame_id == "map"
+    last = of_pose(path.poses[-1].pose)
+    np.testing.assert_allclose(last, in_ros_axes(in_map.T_wc[-1]), atol=1e-9)
+
+    ((_, cloud),) = bag["/map_points"]
+    map_ = load_map(folder / "map.npz").map
+    points = np.frombuffer(cloud.data, "<f4").reshape(-1, 3)
+    fields = [(field.name, field.offset, field.datatype, field.count) for field in cloud.fields]
+    assert fields == [("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1)]  # 7: FLOAT32
+    assert (cloud.header.frame_id, cloud.width, cloud.row_step) == (
+        "map",
+        len(points),
+        12 * len(points),
+    )
+    right, down, ahead = map_.arrays.xyz[map_.living_landmarks()].T
+    np.testing.assert_allclose(points, np.stack([ahead, -right, -down], axis=1), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_robot_that_drives_ahead_has_the_speed_ahead_and_is_less_and_less_sure(folder, tmp_path):
+    export(folder, "--out", tmp_path / "run.mcap")
+    odometry = [message for _, message in read(tmp_path / "run.mcap")["/odom"]]
+    trajectory = read_trajectory(folder / "trajectory_odom.tum")
+    speed = np.linalg.norm(np.diff(trajectory.T_wc[:, :3, 3], axis=0), axis=1) / np.diff(
+        trajectory.timestamps
+    )
+    linear = np.array([[getattr(m.twist.twist.linear, axis) for axis in "xyz"] for m in odometry])
+    assert np.array_equal(linear[0], np.zeros(3))
+    np.testing.assert_allclose(np.linalg.norm(linear[1:], axis=1), speed, rtol=1e-3)
+    assert (linear[1:, 0] > 0.95 * speed).all()
+    assert not np.any(odometry[0].twist.covariance)  # there is no velocity yet
+    for message in odometry[1:]:
+        for covariance in (message.pose.covariance, message.twist.covariance):
+            assert (np.linalg.eigvalsh(np.reshape(covariance, (6, 6))) > 0).all()
+    first, last = (np.trace(np.reshape(odometry[k].pose.covariance, (6, 6))) for k in (1, -1))
+    assert last > first
+
+
+def track(T: np.ndarray, local: np.ndarray | None) -> TrackResult:
+    known = None if local is None else PoseUncertainty(local, np.zeros((6, 6)), 0)
+    return TrackResult(
+        0, 0.0, T, TrackingState.OK, 0, 0, 0, 0, False, T_odom_camera=T, uncertainty=known
+    )
+
+
+def test_the_axes_are_those_of_rep_103():
+    """The camera moves ahead, turns right and moves ahead. First x increases, then y decreases."""
+    types = types_of_ros()
+    before, now = AHEAD, AHEAD @ RIGHT_TURN @ AHEAD
+    poses = [FramePose.of(track(T, None), t) for T, t in ((before, 10**9), (now, 3 * 10**9))]
+    message = odometry_message(types, poses[1], poses[0])
+    position, twist = message.pose.pose.position, message.twist.twist
+    assert position.x == pytest.approx(1.0 + math.cos(0.3))
+    assert position.y == pytest.approx(-math.sin(0.3))
+    assert position.z == pytest.approx(0.0)
+    assert twist.angular.z == pytest.approx(-0.15)  # to the right, in two seconds
+    assert not message.pose.covariance.any()
+    assert not message.twist.covariance.any()
+
+
+def test_covariances_are_those_of_errors_in_the_axes_of_ros():
+    """Errors are drawn as ``vslam.types.odometry`` defines them, and measured as ROS defines them.
+
+    Errors of position and rotation are in the axes of odom. Errors of velocity are in the axes of
+    base_link.
+    """
+    rng = np.random.default_rng(0)
+    near = np.diag([1.0, 4.0, 9.0, 0.01, 0.04, 0.09]) * 1e-6
+    local = near / PoseUncertainty(np.eye(6), np.zeros((6, 6)), 0).local[0, 0]
+    T_1 = AHEAD @ RIGHT_TURN
+    T_2 = T_1 @ se3_exp(np.array([0.1, 0.0, 1.0, 0.0, 0.03, 0.0]))
+    types = types_of_ros()
+    poses = [FramePose.of(track(T, local), t) for T, t in ((T_1, 10**9), (T_2, 15 * 10**8))]
+    message = odometry_message(types, poses[1], poses[0])
+    errors, velocities = [], []
+    for one, two in rng.multivariate_normal(np.zeros(6), near, (4000, 2)):
+        true = [
+            FramePose(t, inverse(se3_exp(xi) @ inverse(T)), np.eye(4))
+            for T, t, xi in ((T_1, 10**9, one), (T_2, 15 * 10**8, two))
+        ]
+        T, estimate = true[1].T_odom_base, poses[1].T_odom_base
+        turn = Rotation.from_matrix(T[:3, :3] @ estimate[:3, :3].T).as_rotvec()
+        errors.append([*(T[:3, 3] - estimate[:3, 3]), *turn])
+        twist = odometry_message(types, true[1], true[0]).twist.twist
+        velocities.append(
+            [getattr(part, axis) for part in (twist.linear, twist.angular) for axis in "xyz"]
+        )
+    for sample, given in ((errors, message.pose), (velocities, message.twist)):
+        measured, promised = np.cov(np.array(sample).T), given.covariance.reshape(6, 6)
+        scale = np.sqrt(np.diag(promised))
+        np.testing.assert_allclose(
+            measured / np.outer(scale, scale), promised / np.outer(scale, scale), atol=0.1
+        )
+
+
+@pytest.mark.parametrize("timestamp", [-0.1, 1.6e12, math.nan])
+def test_times_that_ros_does_not_have_are_refused(timestamp):
+    with pytest.raises(InputError, match="ROS cannot represent the time"):
+        nanoseconds(timestamp)
+
+
+def test_unix_times_keep_their_microseconds():
+    assert nanoseconds(1764049567.123456) == pytest.approx(1764049567123456000, abs=500)
+
+
+@pytest.mark.slow
+def test_refusals(folder, tmp_path, monkeypatch):
+    with pytest.raises(InputError, match=r"run\.bag: must end in \.mcap"):
+        export(folder, "--out", tmp_path / "run.bag")
+    (tmp_path / "run.mcap").touch()
+    with pytest.raises(InputError, match="exists already"):
+        export(folder, "--out", tmp_path / "run.mcap")
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    with pytest.raises(InputError, match=r"pip install 'vslam\[bag\]'"):
+        export(folder, "--out", tmp_path / "other.mcap")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+
+
+@pytest.mark.slow
+def test_a_run_that_only_localises_has_no_landmarks(folder, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    (run / "map.npz").unlink()
+    assert export(run) == f"{run / 'ros.mcap'}: 28 poses, 0 landmarks\n"
+    bag = read(run / "ros.mcap")
+    assert len(bag["/odom"]) == 28
+    ((_, cloud),) = bag["/map_points"]
+    assert (cloud.width, len(cloud.data)) == (0, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "text", "why"),
+    [
+        ("covariance.csv", None, "No such file"),
+        ("trajectory.tum", None, "No such file"),
+        ("covariance.csv", "timestamp\n0.1,1,2,three\n", "damaged"),
+        ("covariance.csv", "timestamp\n0.1,1,2\n", "damaged"),
+        ("trajectory_odom.tum", "0 0 0 0 0 0 0 1\n", "have different frames"),
+    ],
+)
+def test_files_of_a_run_that_were_lost_or_changed(folder, tmp_path, name, text, why):
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    (run / name).unlink()
+    if text is not None:
+        (run / name).write_text(text)
+    with pytest.raises(InputError, match=f"run.*{why}"):
+        export(run)
+    assert not (run / "ros.mcap").exists()
+
+
+# -- examples/ros2 --------------------------------------------------------------------------------
+
+
+def infos(baseline: float = 0.5, **changed: object) -> list[SimpleNamespace]:
+    """Return the ``camera_info`` of a rectified pair, with ``changed`` fields on the right."""
+    pair = []
+    for side in (0, 1):
+        P = [700.0, 0, 310, -side * 700 * baseline, 0, 710, 120, 0, 0, 0, 1, 0]
+        pair.append(SimpleNamespace(p=np.array(P), width=640, height=240))
+    vars(pair[1]).update(changed)
+    return pair
+
+
+@pytest.fixture
+def camera_of():
+    return runpy.run_path(str(ROOT / "examples" / "ros2" / "camera.py"))["camera_of"]
+
+
+def test_the_camera_of_the_node_is_that_of_its_messages(camera_of):
+    assert camera_of(*infos()) == Camera(700.0, 710.0, 310.0, 120.0, 0.5, 640, 240)
+
+
+@pytest.mark.parametrize(
+    ("pair", "why"),
+    [
+        (infos(-0.5), "baseline is -0.500 m"),
+        (infos(width=320), "different sizes"),
+        (infos(p=np.arange(12.0)), "P of the two cameras differs"),
+        ([SimpleNamespace(p=np.zeros(12), width=640, height=240)] * 2, "calibrate the camera"),
+    ],
+)
+def test_the_node_refuses_messages_of_no_rectified_pair(camera_of, pair, why):
+    with pytest.raises(ValueError, match=why):
+        camera_of(*pair)
+
+
+def test_the_node_leaves_ros_although_mapping_has_failed(monkeypatch):
+    ros = ("rclpy.node", "rclpy.qos", "message_filters", "nav_msgs.msg", "sensor_msgs.msg",
+           "tf2_msgs.msg", "camera")  # fmt: skip
+    for name in ros:
+        monkeypatch.setitem(sys.modules, name, Mock(Node=object))
+    monkeypatch.setitem(sys.modules, "rclpy", rclpy := Mock())
+    main = runpy.run_path(str(ROOT / "examples" / "ros2" / "node.py"))["main"]
+    main.__globals__["SlamNode"] = node = Mock()
+    rclpy.spin.side_effect = node().close.side_effect = RuntimeError("mapping failed")
+    with pytest.raises(RuntimeError, match="mapping failed"):
+        main()
+    node().destroy_node.assert_called_once_with()
+    rclpy.try_shutdown.assert_called_once_with()
+
+
+def test_the_node_is_a_program_of_at_most_150_lines():
+    """The node cannot be imported without ROS."""
+    text = (ROOT / "examples" / "ros2" / "node.py").read_text()
+    compile(text, "node.py", "exec")
+    assert len(text.splitlines()) <= 150

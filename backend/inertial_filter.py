@@ -123,8 +123,11 @@ def corrected_by_pose(
     """
     R = state.T_world_imu[:3, :3]
     T_measured = T_world_camera @ inverse(T_imu_camera)
-    A = adjoint(T_imu_camera)
-    A = np.concatenate([A[3:], R @ A[:3]])  # rotation in the IMU's frame, position in the world's
+    R_imu_camera, arm = T_imu_camera[:3, :3], T_imu_camera[:3, 3]
+    A = np.zeros((6, 6))  # from xi to the rotation of the IMU, and its position in the world
+    A[:3, 3:] = R_imu_camera
+    A[3:, :3] = R @ R_imu_camera
+    A[3:, 3:] = R @ _cross_matrix(arm) @ R_imu_camera
     error = np.concatenate(
         [
             so3_log(np.ascontiguousarray(R.T @ T_measured[:3, :3])),

@@ -68,7 +68,7 @@ def with_samples(inertia: Inertia, samples: Matrix) -> Inertia:
     Raises:
         ValueError: the shape is not ``(N, 7)``.
     """
-    known = tidied(np.concatenate([inertia.samples, tidied(samples).samples])).samples
+    known = tidied(np.concatenate([inertia.samples, samples])).samples
     if len(known):
         since = known[-1, 0] - KEPT_S
         if inertia.state is not None:

@@ -6,7 +6,7 @@ result consists of the findings of the checks, and of pictures.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -18,6 +18,7 @@ from vslam.datasets.frames import Source
 from vslam.doctor import checks
 from vslam.doctor.findings import Finding, judge, sections
 from vslam.doctor.focal_length import Moved, fit_focal_length
+from vslam.doctor.imu import examine_imu
 from vslam.frontend.extraction import find_corners
 from vslam.frontend.masks import Mask
 from vslam.report.page import Figure, Page, Section
@@ -63,11 +64,16 @@ class Diagnosis:
 
 
 def examine(sequence: Source, config: Config) -> Diagnosis:
-    """Run all checks that apply to a stereo, RGB-D or monocular sequence.
+    """Run all checks that apply to a stereo, RGB-D or monocular sequence, and to its IMU.
 
     The checks examine rectified images, as a run uses them. Features are extracted as in a run on
     the left images.
     """
+    found = _examine_images(sequence, config)
+    return replace(found, findings=[*found.findings, *examine_imu(sequence, config)])
+
+
+def _examine_images(sequence: Source, config: Config) -> Diagnosis:
     frames = np.unique(np.linspace(0, len(sequence) - 1, _FRAMES).round().astype(int)).tolist()
     read: dict[int, tuple[Image, Image | DepthImage | None]] = {}
     problems = []

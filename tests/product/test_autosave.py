@@ -113,7 +113,9 @@ def test_saving_changes_no_byte(kitti_tree, tmp_path, undisturbed):
 @pytest.mark.parametrize("frame", [9, 17, 26])
 def test_a_killed_run_goes_on_at_the_next_frame(kitti_tree, tmp_path, undisturbed, frame):
     words = [sys.executable, "-c", KILLED, str(kitti_tree), str(tmp_path), str(frame)]
-    done = subprocess.run(words, cwd=Path(__file__).parents[1], timeout=300)
+    here = Path(__file__).parent
+    searched = os.environ | {"PYTHONPATH": str(here.parent)}
+    done = subprocess.run(words, cwd=here, env=searched, timeout=300)
     assert done.returncode == -signal.SIGKILL
     assert len(read_trajectory(tmp_path / ONLINE)) == frame + 1
     unfinished = find_unfinished(tmp_path)

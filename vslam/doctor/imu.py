@@ -18,8 +18,8 @@ from vslam.types.geometry import Matrix
 
 _LONGEST_S, _MOST_FRAMES = 8.0, 160  # images that are tracked
 _PLACE = (
-    "add the section imu with T_imu_camera to the calibration (docs/howto/imu.md); Kalibr measures it "
-    "and time_offset"
+    "add the section imu with T_imu_camera to the calibration; Kalibr measures it and time_offset "
+    "(docs/howto/imu.md)"
 )
 
 

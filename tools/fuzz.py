@@ -35,6 +35,7 @@ from pathlib import Path
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/product"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import valid_files

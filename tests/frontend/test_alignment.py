@@ -61,8 +61,8 @@ def aligned(image, reference, zoom=1.0, centre=NO_SHIFT):
         centre,
         np.array([0]),
         np.eye(2, dtype=np.float32)[None] / np.float32(zoom),
-        config.iterations,
-        config.max_shift,
+        7,
+        2.0,
         config.min_correlation,
     )[0]
 

@@ -472,7 +472,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
         return []  # drawing takes a second
 
     monkeypatch.setattr(run_pipeline, "run_sequence", run_sequence)
-    monkeypatch.setattr(run_pipeline, "begin", lambda camera, settings, saved=None: None)
+    monkeypatch.setattr(run_pipeline, "begin", lambda *given: None)
     monkeypatch.setattr(recorder, "Recorder", lambda: "null")
     monkeypatch.setattr(recorder, "RerunRecorder", lambda target, pictures: str(target))
     monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[1])

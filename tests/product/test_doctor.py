@@ -43,6 +43,7 @@ class Seen:
     name: str = "corridor"
     pairing: Pairing | None = None
     timing: Timing | None = None
+    imu: None = None
 
     def __len__(self):
         return len(self.left)

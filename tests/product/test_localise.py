@@ -24,6 +24,7 @@ from vslam.slam import Slam
 from vslam.support.errors import InputError, ResultsError
 from vslam.types.features import Extracted, TrackingState, TrackResult
 from vslam.types.geometry import inverse
+from vslam_lab.towns import parse_drive
 
 CONFIG = Config()
 NOTHING = Extracted.nothing()
@@ -291,7 +292,15 @@ def mapped(kitti_tree, tmp_path_factory) -> Path:
 ])  # fmt: skip
 def test_only_rendered_drives_along_one_route_share_a_world(dataset, one, other, same):
     worlds = {
-        name_of_world(SimpleNamespace(sequence=SimpleNamespace(dataset=dataset, name=name)))
+        name_of_world(
+            SimpleNamespace(
+                sequence=SimpleNamespace(
+                    dataset=dataset,
+                    name=name,
+                    world=parse_drive(name)[0] if dataset == "synthetic" else "",
+                )
+            )
+        )
         for name in (one, other)
     }
     assert (len(worlds) == 1) == same

@@ -30,6 +30,10 @@ def after(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) ->
     depths = [corridor_depth(c.camera, T).astype(np.float32) for T in c.T_wc]
     values: dict[str, Any] = {
         "frames": list(zip(c.left, c.right, c.timestamps, strict=True)),
+        "inertial_frames": [
+            (left, right, timestamp, np.zeros((0, 7)))
+            for left, right, timestamp in zip(c.left, c.right, c.timestamps, strict=True)
+        ],
         "depth_frames": list(zip(c.left, depths, c.timestamps, strict=True)),
     }
     held = {}

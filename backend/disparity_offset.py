@@ -22,8 +22,8 @@ import numpy as np
 
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.local_mapping import adjust_locally, assemble, map_keyframe
-from vslam.config import Config, StereoConfig
-from vslam.types.camera import Camera
+from vslam.config import StereoConfig
+from vslam.types.context import Context
 from vslam.types.features import shifted_columns
 from vslam.types.map import Map
 from vslam.types.map_kernels import collect_landmarks
@@ -40,26 +40,27 @@ VARIANCE = 3.0
 TOLERANCE = 1e-5  # least relative decrease of the cost; STEP changes it by some thousandths
 
 
-def map_and_calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
+def map_and_calibrate(map_: Map, keyframe: int, context: Context) -> None:
     """Run local mapping for a new keyframe (``map_keyframe``). For a stereo camera, the disparity
     offset of the map is updated after every ``_OFFSET_KEYFRAMES`` keyframes."""
-    map_keyframe(map_, keyframe, camera, config)
-    if config.stereo.offset_sigma > 0.0 and camera.sensor == "stereo":
-        _calibrate(map_, keyframe, camera, config)
+    map_keyframe(map_, keyframe, context)
+    if context.config.stereo.offset_sigma > 0.0 and context.camera.sensor == "stereo":
+        _calibrate(map_, keyframe, context)
 
 
-def _calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
+def _calibrate(map_: Map, keyframe: int, context: Context) -> None:
+    config = context.config.stereo
     known, window = map_.scalars, map_.living_keyframes()
     window = window[window > max([known.calibrated_until, *(k - 1 for k in map_.restarts)])]
     if len(window) < _OFFSET_KEYFRAMES:
         return
     map_.scalars = replace(known, calibrated_until=keyframe)
     landmarks = collect_landmarks(map_.arrays, window, map_.n_landmarks)
-    problem, _ = assemble(map_, window[1:], window[:1], landmarks, camera)
+    problem, _ = assemble(map_, window[1:], window[:1], landmarks, context.camera)
     found, information = remaining_offset(problem)
     if information <= 0.0:
         return
-    prior = config.stereo.offset_sigma**-2.0
+    prior = config.offset_sigma**-2.0
     total = known.offset_information + information
     change = found * information / (prior + total)
     map_.scalars = replace(
@@ -69,7 +70,7 @@ def _calibrate(map_: Map, keyframe: int, camera: Camera, config: Config) -> None
     )
     a, n = map_.arrays, map_.n_rows
     a.u_right[:n] = shifted_columns(a.u_right[:n], a.xy[:n, 0], change)
-    adjust_locally(map_, keyframe, camera, config)
+    adjust_locally(map_, keyframe, context)
 
 
 def offset_sigma(information: float, config: StereoConfig) -> float:

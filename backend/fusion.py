@@ -6,9 +6,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import Config
 from vslam.support.kernels import hamming, kernel
-from vslam.types.camera import Camera
+from vslam.types.context import Context
 from vslam.types.features import CELL, FeatureGrid
 from vslam.types.loops import LoopEdge
 from vslam.types.map import Map
@@ -28,7 +27,7 @@ _FUSE_NEIGHBOURS = 10
 _FUSE_WINDOW = 3.0
 
 
-def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
+def fuse_neighbourhood(map_: Map, keyframe: int, context: Context) -> None:
     """Fuse the landmarks of a keyframe with the landmarks of its neighbours.
 
     The landmarks of the keyframe are projected into its neighbours, and the landmarks of the
@@ -38,9 +37,9 @@ def fuse_neighbourhood(map_: Map, keyframe: int, camera: Camera, config: Config)
     """
     neighbours = fusion_neighbours(map_, keyframe)
     for neighbour in neighbours:
-        fuse_into(map_, map_.landmarks_of(keyframe), neighbour, camera, config)
+        fuse_into(map_, map_.landmarks_of(keyframe), neighbour, context)
     landmarks = collect_landmarks(map_.arrays, np.array(neighbours, np.int64), map_.n_landmarks)
-    fuse_into(map_, landmarks, keyframe, camera, config)
+    fuse_into(map_, landmarks, keyframe, context)
 
 
 def fusion_neighbours(map_: Map, keyframe: int) -> list[int]:
@@ -67,8 +66,7 @@ def fuse_loop(
     edge: LoopEdge,
     query_side: list[int],
     match_side: list[int],
-    camera: Camera,
-    config: Config,
+    context: Context,
 ) -> None:
     """Fuse the landmarks on the two sides of a loop, after the loop was corrected (section VII-D of
     the ORB-SLAM paper).
@@ -88,10 +86,10 @@ def fuse_loop(
     _fuse_pairs(a, first + edge.features.astype(np.int64), edge.landmarks, edge.query)
     old = collect_landmarks(a, np.array(match_side, np.int64), map_.n_landmarks)
     for keyframe in query_side:
-        fuse_into(map_, old, keyframe, camera, config)
+        fuse_into(map_, old, keyframe, context)
     new = collect_landmarks(a, np.array(query_side, np.int64), map_.n_landmarks)
     for keyframe in match_side:
-        fuse_into(map_, new, keyframe, camera, config)
+        fuse_into(map_, new, keyframe, context)
 
 
 @kernel
@@ -110,12 +108,10 @@ def _fuse_pairs(a, rows, landmarks, keyframe):
             link(a, row, landmark)
 
 
-def fuse_into(
-    map_: Map, landmarks: NDArray[np.int32], keyframe: int, camera: Camera, config: Config
-) -> int:
+def fuse_into(map_: Map, landmarks: NDArray[np.int32], keyframe: int, context: Context) -> int:
     """Project ``(N,)`` landmarks into a keyframe, and fuse them with its features and landmarks.
     Returns the number of fusions."""
-    a, rows = map_.arrays, map_.rows(keyframe)
+    a, rows, camera = map_.arrays, map_.rows(keyframe), context.camera
     grid = FeatureGrid.of_positions(a.xy[rows], camera.width, camera.height)
     return _fuse(
         a,
@@ -127,7 +123,7 @@ def fuse_into(
         camera.height,
         map_.scales,
         _FUSE_WINDOW,
-        config.mapping.fuse_distance,
+        context.config.mapping.fuse_distance,
     )
 
 

@@ -13,6 +13,7 @@ from vslam.backend.triangulation import triangulate_with_neighbours
 from vslam.config import Config
 from vslam.support.kernels import kernel
 from vslam.types.camera import DISPARITY_WEIGHT, Camera
+from vslam.types.context import Context
 from vslam.types.map import Map
 from vslam.types.map_kernels import (
     erase_landmark,
@@ -32,15 +33,15 @@ MIN_SHARED = 15
 RECENT_KEYFRAMES = 3  # how long a landmark is on probation, in keyframes (ORB-SLAM, VI-B)
 
 
-def map_keyframe(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
+def map_keyframe(map_: Map, keyframe: int, context: Context) -> None:
     """Run local mapping for a new keyframe, which must already be linked to its landmarks."""
-    cull_recent_landmarks(map_, keyframe, camera)
-    triangulate_with_neighbours(map_, keyframe, camera, config)
+    cull_recent_landmarks(map_, keyframe, context.camera)
+    triangulate_with_neighbours(map_, keyframe, context)
     refresh_keyframe(map_, keyframe)
-    fuse_neighbourhood(map_, keyframe, camera, config)
+    fuse_neighbourhood(map_, keyframe, context)
     refresh_keyframe(map_, keyframe)
-    adjust_locally(map_, keyframe, camera, config)
-    cull_keyframes(map_, keyframe, camera, config)
+    adjust_locally(map_, keyframe, context)
+    cull_keyframes(map_, keyframe, context)
 
 
 def refresh_keyframe(map_: Map, keyframe: int) -> None:
@@ -71,7 +72,7 @@ def _cull_landmarks(a, first, last, keyframe, min_found_ratio, too_few):
             erase_landmark(a, landmark)
 
 
-def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
+def adjust_locally(map_: Map, keyframe: int, context: Context) -> None:
     """Run local bundle adjustment around a keyframe (section VI-D of the ORB-SLAM paper).
 
     The keyframe, its covisible keyframes and all landmarks that these keyframes observe are
@@ -79,8 +80,9 @@ def adjust_locally(map_: Map, keyframe: int, camera: Camera, config: Config) -> 
     the map is also held fixed, because it defines the world frame. Afterwards, observations that
     fail the chi-square test are removed.
     """
+    config = context.config
     free, fixed, landmarks = local_window(map_, keyframe, config)
-    problem, rows = assemble(map_, free, fixed, landmarks, camera)
+    problem, rows = assemble(map_, free, fixed, landmarks, context.camera)
     if len(free) == 0 or len(rows) == 0:
         return
     coarse = adjust(problem, iterations=config.mapping.ba_iterations // 2, tolerance=1e-3)
@@ -198,20 +200,19 @@ def remove_observations(a, rows):
             unlink(a, row)
 
 
-def cull_keyframes(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
+def cull_keyframes(map_: Map, keyframe: int, context: Context) -> None:
     """Cull redundant keyframes among the covisible keyframes of a keyframe (section VI-E of the
     ORB-SLAM paper).
 
     A keyframe is redundant if most of its close landmarks are redundant (``count_redundant``).
     """
     neighbours, shared = map_.covisible(keyframe)
-    close = config.stereo.close_depth_baselines * camera.baseline
-    restarts = map_.restarts
+    bf, restarts = context.camera.bf, map_.restarts
     for neighbour in neighbours[shared >= MIN_SHARED]:
         if neighbour == 0 or neighbour in restarts:
             continue  # the first keyframe of a sub-map defines its frame
-        seen, redundant = count_redundant(map_.arrays, int(neighbour), camera.bf, close)
-        if redundant > config.mapping.redundant_ratio * seen:
+        seen, redundant = count_redundant(map_.arrays, int(neighbour), bf, context.close_depth)
+        if redundant > context.config.mapping.redundant_ratio * seen:
             map_.cull_keyframe(int(neighbour))
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import Config
 from vslam.support.kernels import hamming, inner_kernel, kernel
-from vslam.types.camera import Camera
+from vslam.types.context import Context
 from vslam.types.geometry import inverse, transform
 from vslam.types.map import NONE, Map
 from vslam.types.map_kernels import link_many
@@ -27,7 +26,7 @@ SECTIONS = 512  # number of bins for the direction of an epipolar plane
 
 
 def map_stereo_points(
-    map_: Map, keyframe: int, camera: Camera, config: Config, *, far: bool = False
+    map_: Map, keyframe: int, context: Context, *, far: bool = False
 ) -> NDArray[np.int32]:
     """Create landmarks from the close stereo features of a keyframe that observe no landmark yet.
 
@@ -40,13 +39,13 @@ def map_stereo_points(
     Returns:
         ``(N,)`` ids of the new landmarks.
     """
-    a, rows = map_.arrays, map_.rows(keyframe)
+    camera, a, rows = context.camera, map_.arrays, map_.rows(keyframe)
     xy = a.xy[rows].astype(np.float64)
     depth = camera.bf / (xy[:, 0] - a.u_right[rows])
     nearest = np.argsort(depth, kind="stable")
     nearest = nearest[: np.count_nonzero(np.isfinite(depth))]
-    close = depth[nearest] < config.stereo.close_depth_baselines * camera.baseline
-    among_nearest = np.arange(len(nearest)) < config.mapping.min_stereo_points
+    close = depth[nearest] < context.close_depth
+    among_nearest = np.arange(len(nearest)) < context.config.mapping.min_stereo_points
     nearest = nearest[far | close | among_nearest]
     new = nearest[a.landmark[rows][nearest] == NONE]
     xyz = transform(inverse(a.T_cw[keyframe]), camera.backproject(xy[new], depth[new]))
@@ -55,12 +54,13 @@ def map_stereo_points(
     return ids
 
 
-def triangulate_with_neighbours(map_: Map, keyframe: int, camera: Camera, config: Config) -> None:
+def triangulate_with_neighbours(map_: Map, keyframe: int, context: Context) -> None:
     """Create landmarks by triangulating features of a keyframe and its covisible keyframes.
 
     Features that observe no landmark yet are matched along epipolar lines (section VI-C of the
     ORB-SLAM paper).
     """
+    camera, config = context.camera, context.config
     neighbours, _ = map_.covisible(keyframe)
     limit, min_baseline = config.mapping.neighbours, camera.baseline
     if camera.monocular:

@@ -18,9 +18,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import ConsistencyConfig, VerificationConfig
 from vslam.loopclosure.verification import verify_near
-from vslam.types.camera import Camera
+from vslam.types.context import Context
 from vslam.types.geometry import inverse, se3_log, transform
 from vslam.types.loops import LoopCandidate, LoopEdge, ResembledPlace
 from vslam.types.map import Map
@@ -42,51 +41,57 @@ class LoopConsistency:
 
     Call ``update`` once for every keyframe, even if the keyframe has no candidates. Call
     ``confirm`` for every loop edge that was verified. Call ``reset`` after a loop has been closed.
+
+    Attributes:
+        state: what recent keyframes showed.
     """
 
-    def __init__(self, config: ConsistencyConfig) -> None:
-        self.config = config
-        self._series: list[ResembledPlace] = []
-        self._verified: list[tuple[int, LoopEdge]] = []  # verified edges and their turns
-        self._turn = 0  # number of updates so far
+    def __init__(
+        self, context: Context, verified_memory: int, state: ConsistencyState | None = None
+    ) -> None:
+        """
+        Args:
+            verified_memory: number of further keyframes during which a verified loop is kept while
+                it waits for other loops that agree with it.
+        """
+        self.state = state or ConsistencyState()
+        self._context = context
+        self._config = context.config.consistency
+        self._verified_memory = verified_memory
 
-    def update(
-        self, candidates: list[LoopCandidate], map_: Map
-    ) -> tuple[list[LoopCandidate], list[LoopEdge]]:
+    def update(self, candidates: list[LoopCandidate], map_: Map) -> dict[int, str]:
         """Check whether enough consecutive keyframes resembled the place of each candidate.
 
         The place of a candidate consists of its match and the keyframes that are covisible with the
         match. Two places are considered the same if they share a keyframe.
 
         Returns:
-            The candidates that pass, and a rejected loop edge for each other candidate.
+            The reason to doubt each candidate that does not pass, by its ``match``.
         """
-        self._turn += 1
+        needed, before = self._config.min_keyframes, self.state.places
         series: dict[frozenset[int], ResembledPlace] = {}
-        consistent, rejected = [], []
+        doubts: dict[int, str] = {}
         continued: set[int] = set()
         for candidate in candidates:
             around = map_.covisible(candidate.match, MIN_SHARED)[0].tolist()
             place = frozenset({candidate.match, *around})
-            overlapping = [
-                i for i, one in enumerate(self._series) if not place.isdisjoint(one.keyframes)
-            ]
+            overlapping = [i for i, one in enumerate(before) if not place.isdisjoint(one.keyframes)]
             continued.update(overlapping)
-            length = 1 + max((self._series[i].length for i in overlapping), default=0)
+            length = 1 + max((before[i].length for i in overlapping), default=0)
             series[place] = ResembledPlace(place, length)
-            if length >= self.config.min_keyframes:
-                consistent.append(candidate)
-            else:
-                needed = f"the {self.config.min_keyframes} consecutive keyframes needed"
-                reason = f"proposed for only {length} of {needed}"
-                rejected.append(LoopEdge.of(candidate, reason))
+            if length < needed:
+                doubts[candidate.match] = (
+                    f"proposed for only {length} of the {needed} consecutive keyframes needed"
+                )
         waiting = [
             replace(one, age=one.age + 1)
-            for i, one in enumerate(self._series)
-            if i not in continued and one.age < self.config.max_gap
+            for i, one in enumerate(before)
+            if i not in continued and one.age < self._config.max_gap
         ]
-        self._series = [*series.values(), *waiting]
-        return consistent, rejected
+        self.state = ConsistencyState(
+            (*series.values(), *waiting), self.state.verified, self.state.turn + 1
+        )
+        return doubts
 
     def confirm(self, edge: LoopEdge, map_: Map) -> LoopEdge:
         """Accept a verified loop edge only if it is sufficiently improbable that it is wrong.
@@ -106,15 +111,17 @@ class LoopConsistency:
         """
         if not edge.accepted:
             return edge
-        oldest = self._turn - self.config.verified_memory
-        self._verified = [(turn, e) for turn, e in self._verified if turn >= oldest]
+        turn = self.state.turn
+        verified = self._verified_since(turn - self._verified_memory)
+        self.state = replace(self.state, verified=verified)
         p_other = self._p_agreeing(edge, map_)
-        self._verified.append((self._turn, edge))
-        return self._decided(edge, p_other, self.config.max_wrong)
+        self.state = replace(self.state, verified=(*verified, (turn, edge)))
+        return self._decided(edge, p_other, self._config.max_wrong)
 
-    def decided_at_end(
-        self, map_: Map, camera: Camera, config: VerificationConfig
-    ) -> Iterator[LoopEdge]:
+    def _verified_since(self, turn: int) -> tuple[tuple[int, LoopEdge], ...]:
+        return tuple(one for one in self.state.verified if one[0] >= turn)
+
+    def decided_at_end(self, map_: Map) -> Iterator[LoopEdge]:
         """Decide at the end of a drive about the verified loops that wait for another loop that
         agrees with them. Yield those that are accepted, newest first.
 
@@ -129,14 +136,14 @@ class LoopConsistency:
         it is wrong is allowed.
         """
         nothing = np.empty(0, np.int32)
-        oldest = self._turn + 1 - self.config.verified_memory
-        for waiting in [edge for turn, edge in reversed(self._verified) if turn >= oldest]:
+        verified = self._verified_since(self.state.turn + 1 - self._verified_memory)
+        for _, waiting in reversed(verified):
             if not map_.arrays.keyframe_alive[[waiting.query, waiting.match]].all():
                 continue
-            p_other, limit = self._p_agreeing(waiting, map_), self.config.max_wrong_at_end
-            edge = verify_near(map_, waiting, camera, config)
+            p_other, limit = self._p_agreeing(waiting, map_), self._config.max_wrong_at_end
+            edge = verify_near(map_, waiting, self._context)
             if edge.accepted:
-                p_earlier = self._p_earlier(edge, map_, camera, config)
+                p_earlier = self._p_earlier(edge, map_)
                 edge = self._decided(edge, min(p_other, p_earlier), limit)
             if not edge.accepted:  # the matches that it had may have been culled
                 edge = replace(waiting, features=nothing, landmarks=nothing)
@@ -159,14 +166,12 @@ class LoopConsistency:
         ``edge`` is wrong. It is 1 if no loop agrees."""
         agreeing = [
             other.p_wrong
-            for _, other in self._verified
+            for _, other in self.state.verified
             if other.query != edge.query and self.agree(edge, other, map_)
         ]
         return min(agreeing, default=1.0)
 
-    def _p_earlier(
-        self, edge: LoopEdge, map_: Map, camera: Camera, config: VerificationConfig
-    ) -> float:
+    def _p_earlier(self, edge: LoopEdge, map_: Map) -> float:
         """Return the probability that the loop of an earlier keyframe that confirms ``edge`` is
         wrong. It is 1 if no keyframe confirms it."""
         assert edge.T_query_match is not None
@@ -177,12 +182,12 @@ class LoopConsistency:
         for keyframe in map_.covisible(edge.query)[0].tolist():
             T_keyframe_query = map_.keyframe_pose(keyframe) @ T_w_query
             T_keyframe_query[:3, 3] /= edge.scale  # to the unit around the match
-            if np.linalg.norm(T_keyframe_query[:3, 3]) < self.config.min_moved * depth:
+            if np.linalg.norm(T_keyframe_query[:3, 3]) < self._config.min_moved * depth:
                 continue
             expected = replace(
                 edge, query=keyframe, T_query_match=T_keyframe_query @ edge.T_query_match
             )
-            other = verify_near(map_, expected, camera, config)
+            other = verify_near(map_, expected, self._context)
             if other.accepted and self.agree(edge, other, map_):
                 return other.p_wrong
         return 1.0
@@ -198,18 +203,10 @@ class LoopConsistency:
             and np.degrees(np.linalg.norm(twist[3:])) <= _MAX_TURN
         )
 
-    def state(self) -> ConsistencyState:
-        return ConsistencyState(tuple(self._series), tuple(self._verified), self._turn)
-
-    def restore(self, state: ConsistencyState) -> None:
-        self._series, self._verified = list(state.places), list(state.verified)
-        self._turn = state.turn
-
     def reset(self) -> None:
         """Discard everything that was stored about recent keyframes. This is necessary after a loop
         has been closed, because the map has moved."""
-        self._series.clear()
-        self._verified.clear()
+        self.state = ConsistencyState(turn=self.state.turn)
 
 
 def implied_drift(edge: LoopEdge, map_: Map) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import Config, LearnedMatchingConfig, VerificationConfig
+from vslam.config import LearnedMatchingConfig
 from vslam.loopclosure.evidence import evidence_of, probability_wrong, weighed
 from vslam.loopclosure.learned_alignment import aligned
 from vslam.loopclosure.learned_localisation import SIGMA, PoseEstimate, localise, project, view_of
@@ -34,6 +34,7 @@ from vslam.loopclosure.verification import (
     relative_scale,
 )
 from vslam.types.camera import Camera, Image
+from vslam.types.context import Context
 from vslam.types.features import Features, nearest_features
 from vslam.types.geometry import inverse, orthonormalised, transform
 from vslam.types.loops import LastSeen, Localisation, LoopCandidate, LoopEdge, LoopEvidence
@@ -105,9 +106,7 @@ def verify_learned(
     map_: Map,
     candidate: LoopCandidate,
     images: KeyframeImages,
-    camera: Camera,
-    config: LearnedMatchingConfig,
-    gates: VerificationConfig,
+    context: Context,
 ) -> LoopEdge:
     """Verify a candidate using learned local descriptors. :func:`verification.verify` does the same
     using ORB descriptors.
@@ -116,6 +115,7 @@ def verify_learned(
         The loop edge, either accepted or rejected with a reason. Its features and landmarks are the
         inliers that coincide with a keypoint of the query.
     """
+    camera, config, gates = context.camera, context.config.learned, context.config.verification
     query, match = candidate.query, candidate.match
     edge = LoopEdge.of(candidate, matched_by="learned")
     keyframes = [k for k in place_of(map_, match, query).tolist() if k in images]
@@ -168,8 +168,7 @@ def recognise(
     features: Features,
     match: int,
     images: KeyframeImages,
-    camera: Camera,
-    config: Config,
+    context: Context,
 ) -> Localisation | None:
     """Estimate the pose of a frame outside the map at the place of a keyframe, using learned local
     descriptors.
@@ -183,9 +182,9 @@ def recognise(
         The pose and the observed landmarks. None if the frame fails the tests that a loop must
         pass, or if too few of its keypoints coincide with landmarks to continue tracking.
     """
-    around = [match, *map_.covisible(match)[0].tolist()]
+    config, around = context.config, [match, *map_.covisible(match)[0].tolist()]
     keyframes = [k for k in around if k in images]
-    estimate = localise(map_, query, keyframes, images, camera, seed=match)
+    estimate = localise(map_, query, keyframes, images, context.camera, seed=match)
     if isinstance(estimate, str):
         return None
     index = np.flatnonzero(estimate.seen)
@@ -193,7 +192,7 @@ def recognise(
         return None
     # A frame has no landmarks of its own that could be looked for in the keyframe.
     seen = len(index), len(estimate.seen)
-    evidence = _evidence_of(map_, estimate, camera, query.scale, seen)
+    evidence = _evidence_of(map_, estimate, context.camera, query.scale, seen)
     if probability_wrong(evidence, "learned") > _MAX_WRONG_POSE:
         return None
     feature, near = nearest_features(
@@ -291,10 +290,9 @@ class LearnedRelocalisation:
     """Relocalises frames using learned local descriptors of the stored keyframe images (implements
     ``Recognise``). Without stored images, it finds nothing."""
 
-    def __init__(self, images: KeyframeImages | None, camera: Camera, config: Config) -> None:
+    def __init__(self, images: KeyframeImages | None, context: Context) -> None:
         self._images = images
-        self._camera = camera
-        self._config = config
+        self._context = context
 
     def __call__(
         self,
@@ -304,7 +302,7 @@ class LearnedRelocalisation:
         candidates: list[LoopCandidate],
         last: LastSeen | None,
     ) -> Localisation | None:
-        images, config = self._images, self._config
+        images, config = self._images, self._context.config
         if images is None or image is None:
             return None
         if last is not None and candidates:
@@ -320,9 +318,7 @@ class LearnedRelocalisation:
             return None
         maps = images.network.describe(image)
         for candidate in candidates[: config.learned.max_candidates]:
-            localised = recognise(
-                map_, maps, features, candidate.match, images, self._camera, config
-            )
+            localised = recognise(map_, maps, features, candidate.match, images, self._context)
             if localised is not None:
                 return localised
         return None

@@ -31,6 +31,7 @@ from vslam.frontend.pose import optimise_pose, pose_covariance
 from vslam.loopclosure.evidence import evidence_of, weighed
 from vslam.loopclosure.sim3_ransac import ObservedPoints, align
 from vslam.types.camera import Camera
+from vslam.types.context import Context
 from vslam.types.features import FeatureGrid
 from vslam.types.geometry import Matrix, inverse, orthonormalised, transform
 from vslam.types.loops import LoopCandidate, LoopEdge
@@ -91,12 +92,7 @@ class GuidedMatches(NamedTuple):
         return self.feature >= 0
 
 
-def verify(
-    map_: Map,
-    candidate: LoopCandidate,
-    camera: Camera,
-    config: VerificationConfig,
-) -> LoopEdge:
+def verify(map_: Map, candidate: LoopCandidate, context: Context) -> LoopEdge:
     """Decide whether the query keyframe of a loop candidate shows the place of the match keyframe.
     The map is not changed.
 
@@ -112,14 +108,14 @@ def verify(
     if len(rows_q) < _MIN_MATCHES:
         return replace(edge, reason=f"only {len(rows_q)} descriptors match")
 
-    T_query_match, scale, n_inliers = _consensus(map_, query, match, rows_q, rows_m, camera)
+    T_query_match, scale, n_inliers = _consensus(map_, query, match, rows_q, rows_m, context.camera)
     if T_query_match is None:
         return replace(edge, reason=f"no motion has {_MIN_CONSENSUS} inliers among the matches")
     edge = replace(edge, n_inliers=n_inliers, T_query_match=T_query_match, scale=scale)
-    return verify_near(map_, edge, camera, config)
+    return verify_near(map_, edge, context)
 
 
-def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationConfig) -> LoopEdge:
+def verify_near(map_: Map, edge: LoopEdge, context: Context) -> LoopEdge:
     """Verify a loop edge that already has a pose. In contrast to ``verify``, descriptors are
     matched only near the projections of landmarks.
 
@@ -128,6 +124,7 @@ def verify_near(map_: Map, edge: LoopEdge, camera: Camera, config: VerificationC
     """
     if edge.T_query_match is None:
         raise ValueError(f"the edge from {edge.query} to {edge.match} has no pose")
+    camera, config = context.camera, context.config.verification
     place = place_of(map_, edge.match, edge.query)
     T_mw = map_.keyframe_pose(edge.match)
     landmarks = collect_landmarks(map_.arrays, place, map_.n_landmarks)

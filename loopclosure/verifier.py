@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import Config
 from vslam.loopclosure import verification
 from vslam.loopclosure.learned_verification import (
     is_image_redundant,
@@ -19,7 +18,7 @@ from vslam.loopclosure.learned_verification import (
 )
 from vslam.loopclosure.reach import beyond_reach
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
-from vslam.types.camera import Camera
+from vslam.types.context import Context
 from vslam.types.loops import Descriptors, LoopCandidate, LoopEdge
 from vslam.types.map import Map
 from vslam.types.states import VerifierState
@@ -54,20 +53,23 @@ class Verifier:
     """
 
     def __init__(
-        self, config: Config, camera: Camera, images: KeyframeImages | None = None
+        self,
+        context: Context,
+        images: KeyframeImages | None = None,
+        state: VerifierState | None = None,
     ) -> None:
-        """Create the verifier that ``config.verification.descriptors`` selects.
+        """Create the verifier that ``context.config.verification.descriptors`` selects.
 
         Args:
             images: the result of ``vslam.loopclosure.registry.create_images``. With None, only ORB
                 descriptors are used, regardless of the configuration.
         """
+        config = context.config
         self.images = images
         self.descriptors: tuple[Descriptors, ...] = ("orb",)
         self.verified_memory = config.consistency.verified_memory
-        self.state = VerifierState()
-        self._config = config
-        self._camera = camera
+        self.state = state or VerifierState()
+        self._context = context
         if images is not None:
             only = config.verification.descriptors == "learned"
             self.descriptors = ("learned",) if only else ("orb", "learned")
@@ -76,7 +78,7 @@ class Verifier:
     def is_image_redundant(self, map_: Map, keyframe: int) -> bool:
         """Return whether the image of a keyframe is not needed, because other stored images show
         nearly the same view."""
-        learned = self._config.learned
+        learned = self._context.config.learned
         return self.images is not None and is_image_redundant(map_, keyframe, self.images, learned)
 
     def add(self, map_: Map, keyframe: int, image: NDArray[np.uint8] | None) -> None:
@@ -138,22 +140,15 @@ class Verifier:
         best = max(edges, key=lambda edge: edge.n_inliers)
         return replace(best, reason="; ".join(filter(None, reasons)))
 
-    def restore(self, state: VerifierState) -> None:
-        """Continue from the ``state`` of another verifier."""
-        self.state = state
-
     def _verified(self, map_: Map, candidate: LoopCandidate, kind: Descriptors) -> LoopEdge:
-        camera, config = self._camera, self._config
         if kind == "orb":
-            return verification.verify(map_, candidate, camera, config.verification)
+            return verification.verify(map_, candidate, self._context)
         assert self.images is not None
-        edge = verify_learned(
-            map_, candidate, self.images, camera, config.learned, config.verification
-        )
+        edge = verify_learned(map_, candidate, self.images, self._context)
         if edge.T_query_match is not None:
             self.state = replace(self.state, resting_until=0)
         else:
-            until = candidate.query + 1 + config.learned.retry_interval
+            until = candidate.query + 1 + self._context.config.learned.retry_interval
             self.state = VerifierState(until, candidate.similarity or 0.0)
         return edge
 
@@ -167,11 +162,11 @@ class Verifier:
         similar candidates are tried, and only if their similarity exceeds a limit. After a failed
         attempt, the limit is higher for the next ``learned.retry_interval`` keyframes.
         """
-        images, config = self.images, self._config.learned
+        images, config = self.images, self._context.config.learned
         if images is None:
             return {}
         if keyframe in images and any(one.similarity is None for one in candidates):
-            beyond = beyond_reach(map_, keyframe, self._config.siamese)
+            beyond = beyond_reach(map_, keyframe, self._context.config.siamese)
             glance = images.glance
             candidates = with_similarities(
                 candidates, lambda: glance(keyframe), images, config, beyond

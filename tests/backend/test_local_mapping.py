@@ -30,6 +30,7 @@ from vslam.backend.triangulation import (
 )
 from vslam.config import Config, MappingConfig, StereoConfig
 from vslam.types.camera import Camera
+from vslam.types.context import Context
 from vslam.types.features import Features
 from vslam.types.geometry import inverse, se3_exp, se3_log, transform
 from vslam.types.map import Map
@@ -37,6 +38,7 @@ from vslam.types.map_kernels import link_many
 
 CAMERA = Camera(320.0, 320.0, 319.5, 119.5, 0.5, 640, 240)
 CONFIG = Config()
+CONTEXT = Context.create(CAMERA, CONFIG)
 SCALES = 1.2 ** np.arange(8)
 FLIPPED_BITS = 8
 
@@ -150,7 +152,7 @@ def pose_error(map_: Map, world: World, k: int) -> float:
 def test_stereo_points_are_mapped_where_they_are(check_map):
     world = make_world()
     k = world.add_keyframe(sideways(1.5, yaw=0.1))
-    ids = map_stereo_points(world.map, k, CAMERA, CONFIG)
+    ids = map_stereo_points(world.map, k, CONTEXT)
     a = world.map.arrays
     rows = np.arange(world.map.n_rows)
     depth = transform(world.truth[0], world.points)[world.point_of_row, 2]
@@ -173,7 +175,7 @@ def test_the_nearest_are_mapped_if_too_few_are_close(check_map, least):
     depth = world.points[world.point_of_row, 2]
     close = StereoConfig(close_depth_baselines=2 * np.sort(depth)[30])
     config = Config(stereo=close, mapping=MappingConfig(min_stereo_points=least))
-    map_stereo_points(world.map, k, CAMERA, config)
+    map_stereo_points(world.map, k, Context.create(CAMERA, config))
     mapped = world.map.arrays.landmark[: world.map.n_rows] >= 0
     assert np.count_nonzero(mapped) == least
     assert depth[mapped].max() < depth[~mapped].min()
@@ -185,10 +187,10 @@ def test_features_with_a_landmark_or_without_stereo_are_not_mapped_again():
     k = world.add_keyframe(np.eye(4))
     a = world.map.arrays
     a.u_right[:50] = np.nan
-    first = map_stereo_points(world.map, k, CAMERA, CONFIG)
+    first = map_stereo_points(world.map, k, CONTEXT)
     assert len(first) > 100
     assert (world.map.arrays.landmark[:50] == -1).all()
-    assert len(map_stereo_points(world.map, k, CAMERA, CONFIG)) == 0
+    assert len(map_stereo_points(world.map, k, CONTEXT)) == 0
 
 
 # -- triangulation --------------------------------------------------------------------------------
@@ -313,7 +315,7 @@ def test_triangulation_with_neighbours_adds_landmarks_of_both_keyframes(check_ma
     shared = np.arange(60)
     world.link_truth(range(3), shared)
     before = world.map.n_landmarks
-    triangulate_with_neighbours(world.map, 2, CAMERA, CONFIG)
+    triangulate_with_neighbours(world.map, 2, CONTEXT)
     created = np.arange(before, world.map.n_landmarks)
     assert len(created) > 150
     a = world.map.arrays
@@ -332,7 +334,7 @@ def two_keyframes_with_landmarks_of_their_own() -> World:
     world = make_world(depth=(6, 19))
     for k in range(2):
         world.add_keyframe(sideways(0.5 * k, yaw=0.05 * k))
-        map_stereo_points(world.map, k, CAMERA, CONFIG)
+        map_stereo_points(world.map, k, CONTEXT)
         refresh_keyframe(world.map, k)
     return world
 
@@ -340,23 +342,23 @@ def two_keyframes_with_landmarks_of_their_own() -> World:
 def test_the_landmarks_that_two_keyframes_hold_of_a_point_are_fused(check_map):
     world = two_keyframes_with_landmarks_of_their_own()
     before, both = len(world.map.living_landmarks()), seen_twice(world)
-    fused = fuse_into(world.map, world.map.landmarks_of(0), 1, CAMERA, CONFIG)
+    fused = fuse_into(world.map, world.map.landmarks_of(0), 1, CONTEXT)
     assert both > 200
     assert 0.97 * both < fused <= both
     assert len(world.map.living_landmarks()) == before - fused
     for landmark in world.map.living_landmarks():
         assert len(world.point_of_landmark(landmark)) == 1
     check_map(world.map)
-    assert fuse_into(world.map, world.map.landmarks_of(0), 1, CAMERA, CONFIG) == 0
+    assert fuse_into(world.map, world.map.landmarks_of(0), 1, CONTEXT) == 0
 
 
 def test_fusion_links_features_that_have_no_landmark(check_map):
     world = make_world(depth=(6, 19))
     for k in range(2):
         world.add_keyframe(sideways(0.5 * k))
-    map_stereo_points(world.map, 0, CAMERA, CONFIG)
+    map_stereo_points(world.map, 0, CONTEXT)
     refresh_keyframe(world.map, 0)
-    fused = fuse_into(world.map, world.map.landmarks_of(0), 1, CAMERA, CONFIG)
+    fused = fuse_into(world.map, world.map.landmarks_of(0), 1, CONTEXT)
     linked = world.map.landmarks_of(1)
     assert len(linked) == fused > 0.97 * seen_twice(world)
     assert all(len(world.point_of_landmark(x)) == 1 for x in linked)
@@ -374,7 +376,7 @@ def test_fusion_keeps_the_landmark_with_more_observations():
     third = world.add_keyframe(world.truth[1], among=[point])
     a = world.map.arrays
     link_many(a, np.array([world.map.rows(third).start]), np.array([many]))
-    fuse_into(world.map, world.map.landmarks_of(0), 1, CAMERA, CONFIG)
+    fuse_into(world.map, world.map.landmarks_of(0), 1, CONTEXT)
     assert (a.landmark_alive[few], a.landmark_alive[many]) == (False, True)
     assert a.fused_into[few] == many
 
@@ -393,7 +395,7 @@ def test_fusion_leaves_strangers_alone(spoil):
         a.normal[ids] *= -1
     else:
         a.distance_range[ids] *= 4
-    assert fuse_into(world.map, ids, 1, CAMERA, CONFIG) <= 0.01 * len(ids)
+    assert fuse_into(world.map, ids, 1, CONTEXT) <= 0.01 * len(ids)
 
 
 def test_fusion_of_a_neighbourhood_goes_both_ways(check_map):
@@ -402,9 +404,9 @@ def test_fusion_of_a_neighbourhood_goes_both_ways(check_map):
         world.add_keyframe(sideways(0.4 * k))
     world.link_truth(range(3), np.arange(50))
     for k in range(3):
-        map_stereo_points(world.map, k, CAMERA, CONFIG)
+        map_stereo_points(world.map, k, CONTEXT)
         refresh_keyframe(world.map, k)
-    fuse_neighbourhood(world.map, 1, CAMERA, CONFIG)
+    fuse_neighbourhood(world.map, 1, CONTEXT)
     check_map(world.map)
     a = world.map.arrays
     holders: dict[int, set[int]] = {}
@@ -475,7 +477,7 @@ def test_local_adjustment_repairs_disturbed_keyframes(check_map):
     world = disturbed()
     before = [pose_error(world.map, world, k) for k in range(6)]
     first = world.map.arrays.T_cw[0].tobytes()
-    adjust_locally(world.map, 5, CAMERA, CONFIG)
+    adjust_locally(world.map, 5, CONTEXT)
     after = [pose_error(world.map, world, k) for k in range(6)]
     assert min(before[3:]) > 0.03
     assert max(after) < 1e-3
@@ -490,7 +492,7 @@ def test_local_adjustment_repairs_disturbed_keyframes(check_map):
 def test_local_adjustment_with_noise_reduces_the_error_tenfold():
     world = disturbed(noise=0.3)
     before = max(pose_error(world.map, world, k) for k in range(6))
-    adjust_locally(world.map, 5, CAMERA, CONFIG)
+    adjust_locally(world.map, 5, CONTEXT)
     assert max(pose_error(world.map, world, k) for k in range(6)) < 0.1 * before
 
 
@@ -504,7 +506,7 @@ def test_local_adjustment_removes_wrong_observations_and_only_those(check_map):
     wrong = often[one_of_each[::8]]
     assert len(wrong) > 20
     a.xy[wrong, 1] += 40.0
-    adjust_locally(world.map, 5, CAMERA, CONFIG)
+    adjust_locally(world.map, 5, CONTEXT)
     free = np.flatnonzero(a.landmark[: world.map.n_rows] < 0)
     assert set(wrong.tolist()) <= set(free.tolist())
     assert len(np.setdiff1d(np.intersect1d(observed, free), wrong)) < 0.01 * len(observed)
@@ -534,7 +536,7 @@ def test_keyframes_outside_the_window_are_held():
     np.testing.assert_array_equal(np.concatenate([free, fixed])[problem.camera], a.keyframe[rows])
     before = a.T_cw[:3].tobytes()
     a.T_cw[6] = se3_exp(np.array([0.03, 0, 0.02, 0, 0.004, 0])) @ a.T_cw[6]
-    adjust_locally(world.map, 6, CAMERA, CONFIG)
+    adjust_locally(world.map, 6, CONTEXT)
     assert a.T_cw[:3].tobytes() == before
     assert pose_error(world.map, world, 6) < 1e-3
 
@@ -572,7 +574,7 @@ def redundant_world(own: int = 30) -> World:
 def test_the_redundant_keyframe_is_culled_and_no_other(check_map):
     world = redundant_world()
     assert world.map.rows(2).stop - world.map.rows(2).start > 80
-    cull_keyframes(world.map, 5, CAMERA, CONFIG)
+    cull_keyframes(world.map, 5, CONTEXT)
     assert world.map.living_keyframes().tolist() == [0, 1, 3, 4, 5]
     assert world.map.parents[3] == 1
     assert len(world.map.landmarks_of(2)) == 0
@@ -586,7 +588,7 @@ def test_two_observers_besides_are_not_enough():
         rows = np.arange(world.map.rows(k).start, world.map.rows(k).stop)
         shared = rows[world.point_of_row[rows] < 100]
         remove_observations(world.map.arrays, shared)
-    cull_keyframes(world.map, 5, CAMERA, CONFIG)
+    cull_keyframes(world.map, 5, CONTEXT)
     assert world.map.living_keyframes().tolist() == list(range(6))
 
 
@@ -597,16 +599,16 @@ def test_observers_at_a_coarser_scale_do_not_make_a_keyframe_redundant():
     for k in (0, 1, 3, 4, 5):
         a.octave[world.map.rows(k)] = 1
     a.octave[world.map.rows(0)] = a.octave[world.map.rows(1)] = a.octave[world.map.rows(3)] = 2
-    cull_keyframes(world.map, 5, CAMERA, CONFIG)
+    cull_keyframes(world.map, 5, CONTEXT)
     assert 2 in world.map.living_keyframes()
     a.octave[world.map.rows(3)] = 1  # keyframes 3, 4 and 5 are at most one level coarser
-    cull_keyframes(world.map, 5, CAMERA, CONFIG)
+    cull_keyframes(world.map, 5, CONTEXT)
     assert 2 not in world.map.living_keyframes()
 
 
 def test_the_first_keyframe_is_never_culled():
     world = redundant_world(own=0)  # each is redundant if three others remain
-    cull_keyframes(world.map, 5, CAMERA, CONFIG)
+    cull_keyframes(world.map, 5, CONTEXT)
     living = world.map.living_keyframes().tolist()
     assert len(living) == 3
     assert (living[0], living[-1]) == (0, 5)
@@ -619,12 +621,12 @@ def test_mapping_a_keyframe_keeps_the_map_sound_and_true(check_map):
     world = make_world(n=600)
     for k in range(6):
         world.add_keyframe(sideways(0.4 * k, yaw=0.02 * k, forward=0.3 * k), noise=0.2)
-        map_stereo_points(world.map, k, CAMERA, CONFIG)
+        map_stereo_points(world.map, k, CONTEXT)
         refresh_keyframe(world.map, k)
         if k:
             tracked = world.map.landmarks_of(k - 1)
-            fuse_into(world.map, tracked, k, CAMERA, CONFIG)
-            map_keyframe(world.map, k, CAMERA, CONFIG)
+            fuse_into(world.map, tracked, k, CONTEXT)
+            map_keyframe(world.map, k, CONTEXT)
         check_map(world.map)
     a = world.map.arrays
     mixed = [i for i in world.map.living_landmarks() if len(world.point_of_landmark(i)) > 1]

@@ -370,8 +370,7 @@ def two_keyframes():
     from vslam.loopclosure.verifier import Verifier
     from vslam.method.closing import LoopClosing
 
-    config = Config()
-    closing = LoopClosing(NoDetector(), Verifier(config, CAMERA), CAMERA, config, threads=1)
+    closing = LoopClosing(NoDetector(), Verifier(CONTEXT), CONTEXT, threads=1)
     mapper = Mapper(CONTEXT, closing, Workers(1))
     published = mapper.published
     first, second = (frame_of(extracted_at(100, 50, 0, 3), k, 0.1 * k) for k in range(2))

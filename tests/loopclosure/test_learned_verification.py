@@ -18,6 +18,7 @@ from vslam.loopclosure.learned_verification import (
 from vslam.loopclosure.local_matching import DescriptorMaps
 from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDescriptors
 from vslam.types.camera import Camera
+from vslam.types.context import Context
 from vslam.types.features import Features
 from vslam.types.geometry import inverse, se3_exp, transform
 from vslam.types.loops import LastSeen, LoopCandidate
@@ -27,6 +28,7 @@ from vslam.types.map_kernels import link_many
 CAMERA = Camera(400.0, 400.0, 320.0, 96.0, 0.5, 640, 192)
 DEPTH = 8.0
 CONFIG = Config()
+CONTEXT = Context.create(CAMERA, CONFIG)
 
 
 def wall(seed: int) -> np.ndarray:
@@ -114,9 +116,11 @@ class World:
 
     def verify(self, camera: Camera = CAMERA):
         return verify_learned(
-            self.map, LoopCandidate(1, 0, 0.9, similarity=0.5), self.images, camera,
-            CONFIG.learned, CONFIG.verification,
-        )  # fmt: skip
+            self.map,
+            LoopCandidate(1, 0, 0.9, similarity=0.5),
+            self.images,
+            Context.create(camera, CONFIG),
+        )
 
 
 T_1_0 = se3_exp(np.array([1.2, 0.1, 0.6, 0.0, 0.12, 0.01]))
@@ -158,12 +162,12 @@ def test_a_lost_frame_is_recognised(network):
     world = World(network, T_1_0)
     maps = network.describe(world.night)
     features = Features.none()
-    given = (world.map, maps, features, 0, world.images, CAMERA, CONFIG)
+    given = (world.map, maps, features, 0, world.images, CONTEXT)
     assert recognise(*given) is None  # there are no keypoints
     rows = world.map.rows(1)
     a = world.map.arrays
     features = Features(a.xy[rows], a.octave[rows], a.angle[rows], np.zeros(0), a.u_right[rows])
-    found = recognise(world.map, maps, features, 0, world.images, CAMERA, CONFIG)
+    found = recognise(world.map, maps, features, 0, world.images, CONTEXT)
     assert np.linalg.norm((inverse(found.T_cw) @ T_1_0)[:3, 3]) < 0.1
     expected = transform(T_1_0, a.xyz[found.landmark])
     uv = expected[:, :2] / expected[:, 2:] * 400.0 + [320, 96]
@@ -175,7 +179,7 @@ def test_a_lost_frame_is_not_recognised_where_the_camera_cannot_be(network):
     world = World(network, T_1_0)
     a, rows = world.map.arrays, world.map.rows(1)
     features = Features(a.xy[rows], a.octave[rows], a.angle[rows], np.zeros(0), a.u_right[rows])
-    find = LearnedRelocalisation(world.images, CAMERA, CONFIG)
+    find = LearnedRelocalisation(world.images, CONTEXT)
     given = world.map, world.night, features, [LoopCandidate(-1, 0, 1.0)]
     assert find(*given, None).keyframe == 0  # the camera may be anywhere
     assert find(*given, LastSeen(1, 10.0)).keyframe == 0

@@ -31,6 +31,7 @@ from vslam.loopclosure.verifier import Verifier
 from vslam.method.closing import LoopClosing
 from vslam.support.errors import InputError, ResultsError
 from vslam.types.camera import Camera
+from vslam.types.context import Context
 from vslam.types.features import Features
 from vslam.types.loops import LastSeen
 from vslam.types.map import PREDICTED, UNPREDICTED, Map
@@ -470,8 +471,8 @@ def test_the_paper_s_detector_compares_with_all_keyframes_and_verifies_by_orb():
     detector, images = detector_with_images("capsule-paper", config)
     assert images is None  # local descriptors neither rerank nor verify
     camera = Camera(400.0, 400.0, 310.0, 94.0, 0.5, 620, 188)
-    verifier = Verifier(config, camera, images)
-    closing = LoopClosing(detector, verifier, camera, config, threads=1)
+    context = Context.create(camera, config)
+    closing = LoopClosing(detector, Verifier(context, images), context, threads=1)
     # According to odometry, the last keyframe is 700 m from the first one, but shows its place.
     map_ = driven([50.0 * k for k in range(15)])
     for keyframe, place in enumerate([*range(14), 0]):

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from test_local_mapping import CAMERA, World, make_world
 
-from vslam.config import ConsistencyConfig, VerificationConfig
+from vslam.config import Config, ConsistencyConfig, VerificationConfig
 from vslam.loopclosure.verification import guided_match, reverse_match, verify
+from vslam.types.context import Context
 from vslam.types.geometry import inverse, se3_exp, se3_log
 from vslam.types.loops import LoopCandidate
 from vslam.types.map_kernels import link_many, refresh_landmarks
 
 CONFIG = VerificationConfig()
+CONTEXT = Context.create(CAMERA, Config())
 PASS = 4  # keyframes of each pass
 DRIFT = se3_exp(np.array([3.0, -0.4, 5.0, 0.02, 0.15, -0.01]))
 
@@ -71,7 +73,8 @@ def street(among=None, *, mono: bool = False, seed: int = 0, noise: float = 0.5)
 
 
 def check(world: World, config: VerificationConfig = CONFIG, query: int = 6, match: int = 1):
-    return verify(world.map, LoopCandidate(query, match, 0.5), CAMERA, config)
+    context = Context.create(CAMERA, Config(verification=config))
+    return verify(world.map, LoopCandidate(query, match, 0.5), context)
 
 
 def error(world: World, edge) -> tuple[float, float]:

@@ -19,6 +19,7 @@ from vslam.loopclosure.verifier import Verifier
 from vslam.method.closing import LoopClosing
 from vslam.method.hypotheses import Hypothesis, joined_submaps, solve
 from vslam.slam import Slam
+from vslam.types.context import Context
 from vslam.types.features import Extracted, Features, TrackingState
 from vslam.types.geometry import inverse
 from vslam.types.loops import LoopCandidate
@@ -284,7 +285,7 @@ class Accepting(Verifier):
     """A verifier that accepts every candidate as the same verified loop."""
 
     def __init__(self, edge):
-        super().__init__(Config(), CAMERA)
+        super().__init__(Context.create(CAMERA, Config()))
         self.edge = edge
 
     def verify(self, map_, trial):
@@ -295,7 +296,9 @@ def closing_of(edge, config, threads=1):
     """Make loop closing that accepts one loop as soon as it is a candidate."""
     at_once = ConsistencyConfig(min_keyframes=1, max_wrong=0.5)
     config = config.model_copy(update={"consistency": at_once})
-    return LoopClosing(NoDetector(), Accepting(edge), CAMERA, config, threads=threads)
+    return LoopClosing(
+        NoDetector(), Accepting(edge), Context.create(CAMERA, config), threads=threads
+    )
 
 
 @cache
@@ -309,7 +312,7 @@ def open_loop(gap):
     assert len(slam.map.restarts) == 1
     assert not slam.map.unpredicted_restarts
     candidate = Oracle(ring, frames).query(slam.map.n_keyframes - 1, slam.map)[0]
-    edge = verify(slam.map, candidate, CAMERA, Config().verification)
+    edge = verify(slam.map, candidate, slam.context)
     assert edge.accepted
     return slam.map, edge
 
@@ -405,16 +408,17 @@ def test_loop_closing_restored_from_its_state_closes_the_loop_that_waits():
     map_ = copy.deepcopy(open_loop("carried")[0])
     oracle, last = Oracle(ring, frames), map_.n_keyframes - 1
     config = Config(consistency=ConsistencyConfig(min_keyframes=1, max_wrong=1e-4))
+    context = Context.create(CAMERA, config)
 
-    def create():
-        return LoopClosing(NoDetector(), Verifier(config, CAMERA), CAMERA, config, threads=1)
+    def create(state=None):
+        return LoopClosing(NoDetector(), Verifier(context), context, threads=1, state=state)
 
-    stopped, restored, fresh = create(), create(), create()
+    stopped, fresh = create(), create()
     stopped.count_reused_keyframe(map_, new=True)
     stopped.consider(map_, last - 1, oracle.query(last - 1, map_))
     assert stopped.edges[-1].reason.startswith("verified, but wrong")
     assert fresh.state() != stopped.state()
-    restored.restore(stopped.state())
+    restored = create(stopped.state())
     assert restored.state() == stopped.state()
     candidates = oracle.query(last, map_)
     for closing in (fresh, restored):
@@ -427,9 +431,10 @@ def test_the_map_is_adjusted_again_after_enough_revisits():
     map_ = copy.deepcopy(open_loop("carried")[0])
     n = len(map_.living_keyframes())
     config = Config(loops=LoopConfig(min_revisits=3, revisits_share=5.5 / n))
+    context = Context.create(CAMERA, config)
 
     def closing() -> LoopClosing:
-        return LoopClosing(NoDetector(), Verifier(config, CAMERA), CAMERA, config, threads=1)
+        return LoopClosing(NoDetector(), Verifier(context), context, threads=1)
 
     leaving, staying = closing(), closing()
     for count in (1, 2, 3):

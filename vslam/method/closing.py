@@ -27,13 +27,12 @@ from vslam.backend.global_mapping import GlobalSnapshot, apply_solution, take_sn
 from vslam.backend.local_mapping import adjust_locally, strong_neighbours
 from vslam.backend.loop_correction import move_keyframes
 from vslam.backend.similarity_graph import loop_in_new_units, move_keyframes_similarly
-from vslam.config import Config
 from vslam.loopclosure.consistency import LoopConsistency
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.verifier import Verifier
 from vslam.method.hypotheses import Hypothesis, Solution, solve
 from vslam.support.plugins import reason
-from vslam.types.camera import Camera
+from vslam.types.context import Context
 from vslam.types.features import Features
 from vslam.types.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.types.map import Map
@@ -66,10 +65,10 @@ class LoopClosing:
         self,
         detector: LoopDetector,
         verifier: Verifier,
-        camera: Camera,
-        config: Config,
+        context: Context,
         *,
         threads: int,
+        state: ClosingState | None = None,
     ) -> None:
         self.detector = detector
         self.verifier = verifier
@@ -77,14 +76,15 @@ class LoopClosing:
         self.corrections: list[LoopCorrection] = []
         self.closed: list[LoopEdge] = []
         self.problems: list[str] = []
-        self._camera = camera
-        self._config = config
-        memory = {"verified_memory": verifier.verified_memory}
-        self._consistency = LoopConsistency(config.consistency.model_copy(update=memory))
+        self._context = context
+        self._camera = context.camera
+        self._config = context.config
+        state = state or ClosingState()
+        memory = verifier.verified_memory
+        self._consistency = LoopConsistency(context, memory, state.consistency)
         self._executor = ThreadPoolExecutor(1, "global-adjustment") if threads > 1 else None
         self._global: _PendingAdjustment | None = None
-        self._followed = 0  # number of frames for which an old keyframe was reused
-        self._new_revisits = 0  # number of revisits since the last global bundle adjustment began
+        self._followed, self._new_revisits = state.followed, state.new_revisits
 
     def process(
         self, map_: Map, keyframe: int, features: Features, image: NDArray[np.uint8] | None
@@ -117,8 +117,7 @@ class LoopClosing:
 
     def _find(self, map_: Map, keyframe: int, candidates: list[LoopCandidate]) -> LoopSearch:
         """Verify loop candidates, best first, until a candidate passes. The map is only read."""
-        _, unrepeated = self._consistency.update(candidates, map_)
-        doubts = {edge.match: edge.reason for edge in unrepeated}
+        doubts = self._consistency.update(candidates, map_)
         trials, edges = self.verifier.order(map_, keyframe, candidates, doubts)
         for number, trial in enumerate(trials):
             edge = self._consistency.confirm(self.verifier.verify(map_, trial), map_)
@@ -134,14 +133,8 @@ class LoopClosing:
     def state(self) -> ClosingState:
         """Return the state for a checkpoint, without the loop detector and the images."""
         return ClosingState(
-            self._consistency.state(), self.verifier.state, self._followed, self._new_revisits
+            self._consistency.state, self.verifier.state, self._followed, self._new_revisits
         )
-
-    def restore(self, state: ClosingState) -> None:
-        """Restore a state that the method ``state`` returned."""
-        self._consistency.restore(state.consistency)
-        self.verifier.restore(state.verifier)
-        self._followed, self._new_revisits = state.followed, state.new_revisits
 
     @property
     def is_adjusting(self) -> bool:
@@ -198,9 +191,9 @@ class LoopClosing:
         Normally, a later keyframe confirms such a loop. At the end of a drive, there is no later
         keyframe, and the loop is decided without it (``LoopConsistency.decided_at_end``).
         """
-        gates, found, edges = self._config.verification, None, []
+        found, edges = None, []
         with self._failure_reported("Looking for loops"):
-            for edge in self._consistency.decided_at_end(map_, self._camera, gates):
+            for edge in self._consistency.decided_at_end(map_):
                 outcome, found = self._solve(map_, edge)
                 edges.append(outcome)
                 if found is not None:
@@ -272,8 +265,8 @@ class LoopClosing:
         for keyframe in solution.mistracked:  # its observations are as wrong as its pose
             cut_path(map_.arrays, keyframe, map_.n_keyframes)
         self._correct(map_, solution)
-        fuse_loop(map_, edge, query_side, match_side, self._camera, self._config)
-        adjust_locally(map_, edge.query, self._camera, self._config)
+        fuse_loop(map_, edge, query_side, match_side, self._context)
+        adjust_locally(map_, edge.query, self._context)
         seconds = time.perf_counter() - loop.start
         self.corrections.append(LoopCorrection(edge, keyframes, before, solution.T_cw, seconds))
         self._consistency.reset()  # the correction has moved the places that it remembers

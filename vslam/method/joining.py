@@ -22,6 +22,7 @@ from vslam.loopclosure.verifier import Verifier
 from vslam.maps.stored_map import StoredMap, appended
 from vslam.method.closing import LoopClosing
 from vslam.types.camera import same_camera
+from vslam.types.context import Context
 from vslam.types.features import Features
 from vslam.types.loops import LoopCandidate, LoopEdge
 from vslam.types.map import Map
@@ -112,8 +113,8 @@ def join(
     if images is not None and both.images is not None:
         images.restore(both.images, one.camera.width)
     # With threads=1, global bundle adjustment runs only in finish(), after the last loop.
-    verifier = Verifier(config, one.camera, images)
-    closing = LoopClosing(detector, verifier, one.camera, config, threads=1)
+    context = Context.create(one.camera, config)
+    closing = LoopClosing(detector, Verifier(context, images), context, threads=1)
     closing.closed.extend(both.loops)
     map_, n = both.map, one.map.n_keyframes
     for keyframe in range(n, map_.n_keyframes):

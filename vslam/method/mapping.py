@@ -74,7 +74,7 @@ class Mapper:
             track = self._make_room(map_, track)
             certainty = certainty_of(track, config.alignment)
             keyframe = add_frame(map_, track, certainty, published.reference, predicted=predicted)
-            map_stereo_points(map_, keyframe, self._context.camera, config)
+            map_stereo_points(map_, keyframe, self._context)
             refresh_keyframe(map_, keyframe)
             if sees_old_place(map_, keyframe, MIN_SHARED):
                 closing.count_revisit(map_)
@@ -102,13 +102,13 @@ class Mapper:
             The frame with the added landmarks. None if no points were added: the frame is not such
             a keyframe, or another keyframe follows it.
         """
-        published, context = self.published, self._context
+        published = self.published
         (track,) = published.complete(track)
         with published.change() as map_:
             keyframe = published.reference
             if not has_more_points(map_, keyframe, track):
                 return None
-            new = map_stereo_points(map_, keyframe, context.camera, context.config, far=True)
+            new = map_stereo_points(map_, keyframe, self._context, far=True)
             refresh_keyframe(map_, keyframe)
             published.refer_to(keyframe)
             return observe_keyframe(track, map_, keyframe) if len(new) else None
@@ -168,5 +168,5 @@ class Mapper:
         return replace(track, landmark=landmark)
 
     def _map_keyframe(self, keyframe: int, map_: Map) -> None:
-        map_and_calibrate(map_, keyframe, self._context.camera, self._context.config)
+        map_and_calibrate(map_, keyframe, self._context)
         self._closing.apply_adjustment_if_due(map_, keyframe)

@@ -141,10 +141,11 @@ class Session:
         Raises:
             ValueError: the map cannot be continued. The message gives the reason in a few words.
         """
-        camera, config = context.camera, context.config
-        verifier = Verifier(config, camera, images)
+        checkpoint = start.checkpoint if start is not None and resume else None
+        state = None if checkpoint is None else checkpoint.closing
+        verifier = Verifier(context, images, None if state is None else state.verifier)
         self.closing = closing = LoopClosing(
-            detector, verifier, camera, config, threads=workers.threads
+            detector, verifier, context, threads=workers.threads, state=state
         )
         self.opened = opened = open_map(start, context, closing, localize=localize, resume=resume)
         self._mapper = mapper = Mapper(context, closing, workers, opened.map, opened.frames)
@@ -152,7 +153,7 @@ class Session:
         self.rig = RigMonitor()
         self.last: Track | None = None
         self._context = context
-        recognise = LearnedRelocalisation(images, camera, config)
+        recognise = LearnedRelocalisation(images, context)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)
         self._motion = Motion(context, self.published.frames, imu)
         self._tracker = tracker = Tracker(context)
@@ -383,7 +384,6 @@ class Session:
         """Restore the state of all parts, given the map that was stored together with it."""
         self.published.restore(state.mapper)
         self._mode.restore(state.policy)
-        self.closing.restore(state.closing)
         self.rig = RigMonitor(state.sides)
         self._motion.restore(state.odometry, state.tracker.lost_frames, state.inertia)
         last = restored_track(state.tracker, self._context)

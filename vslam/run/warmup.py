@@ -243,9 +243,8 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
         The map and the features of the last keyframe.
     """
     config = Config(mapping=MappingConfig(redundant_ratio=1e-6))
-    verifier = Verifier(config, CAMERA)
-    closing = LoopClosing(NoDetector(), verifier, CAMERA, config, threads=1)
     context = Context.create(CAMERA, config)
+    closing = LoopClosing(NoDetector(), Verifier(context), context, threads=1)
     mapper = Mapper(context, closing, Workers(1))
     rng = np.random.default_rng(0)
     n = 400
@@ -274,12 +273,11 @@ def map_synthetic(keyframes: int) -> tuple[Map, Features]:
 
 def compile_recognition() -> None:
     """Compile loop detection, verification and relocalisation."""
-    config = Config()
+    context = Context.create(CAMERA, Config())
     map_, features = map_synthetic(1)
-    verify(map_, LoopCandidate(0, 0, 1.0), CAMERA, config.verification)
+    verify(map_, LoopCandidate(0, 0, 1.0), context)
 
     place = local_map(map_, 0, 1)
-    context = Context.create(CAMERA, config)
     lost = Track(0, 0.0, np.eye(4)).with_features(Extracted(features))
     relocalised(lost, place, place, context, seed=0)
 
@@ -312,7 +310,7 @@ def compile_correction() -> None:
     graph = essential_graph(map_, [edge], config.pose_graph)
     check_pose_graph(graph, graph.T_cw, config.pose_graph)
     move_keyframes(map_, graph.keyframes, graph.T_cw)
-    fuse_loop(map_, edge, [2], [0], CAMERA, config)
+    fuse_loop(map_, edge, [2], [0], Context.create(CAMERA, config))
     snapshot = take_snapshot(map_, CAMERA)
     apply_solution(map_, snapshot, adjust_globally(snapshot.problem, iterations=1))
 

@@ -84,7 +84,7 @@ class Localiser:
         places, images = detector_with_images(detector, config)
         slam = Slam.load(day.path, config, places, images=images, localize=True)
         self._context, self._map = slam.context, slam.map
-        recognise = LearnedRelocalisation(images, slam.context.camera, config)
+        recognise = LearnedRelocalisation(images, slam.context)
         self._relocaliser = Relocaliser(slam.context, places.locate, recognise)
 
     def pose(self, image: Image) -> Matrix | None:

@@ -58,15 +58,15 @@ def collect(out: Path, drive: str, perturb: str, seed: int) -> None:
         slam.step(left, right, frame.timestamp)
         lefts.append(left)
     slam.finish()
-    map_, camera, gates = slam.map, source.camera, config.verification
+    map_ = slam.map
     for keyframe in map_.living_keyframes().tolist():
         images.add(keyframe, lefts[map_.frames[keyframe]])
 
     def edges() -> Iterator[LoopEdge]:
         for candidate in pairs_of(map_, images, config):
-            yield verification.verify(map_, candidate, camera, gates)
+            yield verification.verify(map_, candidate, slam.context)
             if candidate.similarity is not None:
-                yield verify_learned(map_, candidate, images, camera, config.learned, gates)
+                yield verify_learned(map_, candidate, images, slam.context)
 
     def true_pose(keyframe: int) -> np.ndarray:
         nearest = np.argmin(np.abs(truth.timestamps - map_.timestamps[keyframe]))

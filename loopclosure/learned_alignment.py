@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.frontend.alignment import align, warps
-from vslam.frontend.pose import optimise_pose, pose_covariance
-from vslam.loopclosure.learned_localisation import PoseEstimate, project
+from vslam.frontend.pose import optimise_pose
+from vslam.loopclosure.learned_localisation import PoseEstimate, estimate_at, observations
 from vslam.loopclosure.siamese.local_descriptors import WIDTH, KeyframeImages
 from vslam.types.camera import Camera
 from vslam.types.features import PATCH_PIXELS, PATCH_RADIUS
 from vslam.types.geometry import Matrix
 from vslam.types.map import Map
-from vslam.types.reprojection import stack_uvr
 
 _ITERATIONS = 10
 _MAX_SHIFT = 3.0  # pixels of the stored images; a learned pose is up to 0.3 degrees wrong
@@ -56,39 +55,25 @@ def aligned(
     seen, keyframe, xy = seen[observed_before], keyframe[observed_before], xy[observed_before]
     xyz = map_.arrays.xyz[estimate.landmarks[seen]]
     uv = np.full((len(seen), 2), np.nan)
+    image = images.image(query)
     for one in np.unique(keyframe).tolist():
         of_one = np.flatnonzero(keyframe == one)
         uv[of_one] = _positions(
-            images.image(one), images.image(query), xy[of_one], estimate.uv[seen[of_one]],
+            images.image(one), image, xy[of_one], estimate.uv[seen[of_one]],
             xyz[of_one], map_.keyframe_pose(one), estimate.T_cw, camera,
         )  # fmt: skip
     found = np.flatnonzero(np.isfinite(uv[:, 0]))
     if len(found) < min_inliers:
         return None
-    observed = stack_uvr(uv[found], np.full(len(found), np.nan))
-    inverse_variance = np.full(len(found), (_SIGMA * camera.width / WIDTH) ** -2.0)
-    T_cw, inlier = optimise_pose(
-        estimate.T_cw, xyz[found], observed, inverse_variance, camera.intrinsics
-    )
+    observed = observations(uv[found], _SIGMA * camera.width / WIDTH)
+    T_cw, inlier = optimise_pose(estimate.T_cw, xyz[found], *observed, camera.intrinsics)
     if np.count_nonzero(inlier) < min_inliers:
         return None
-    covariance = pose_covariance(
-        T_cw,
-        xyz[found][inlier],
-        observed[inlier],
-        inverse_variance[inlier],
-        camera.intrinsics,
-        np.full(np.count_nonzero(inlier), camera.intrinsics[5]),
-    )
-    expected = project(map_.arrays.xyz[estimate.landmarks], T_cw, camera)
-    visible = np.flatnonzero(np.isfinite(expected[:, 0]))
-    return estimate._replace(
-        landmarks=estimate.landmarks[visible],
-        uv=expected[visible],
-        seen=estimate.seen[visible],
-        T_cw=T_cw,
-        covariance=covariance,
-    )
+    observed = observed[0][inlier], observed[1][inlier]
+    return estimate_at(
+        T_cw, map_, estimate.landmarks, estimate.seen, estimate.n_matches, xyz[found][inlier],
+        observed, camera,
+    )  # fmt: skip
 
 
 def _first_observations(

@@ -166,20 +166,38 @@ def guided_search(
         hit = np.flatnonzero(np.isfinite(found[:, 0]))
         observed = _observed(found[hit], query)
         T_cw, inlier = optimise_pose(T_cw, xyz[hit], *observed, camera.intrinsics)
-    covariance = pose_covariance(
-        T_cw,
-        xyz[hit][inlier],
-        observed[0][inlier],
-        observed[1][inlier],
-        camera.intrinsics,
-        np.full(np.count_nonzero(inlier), camera.intrinsics[5]),
-    )
-    expected = project(xyz, T_cw, camera)
+    hit = hit[inlier]
     seen = np.zeros(len(landmarks), np.bool_)
-    seen[hit[inlier]] = True
+    seen[hit] = True
+    observed = observed[0][inlier], observed[1][inlier]
+    return estimate_at(T_cw, map_, landmarks, seen, len(inlier), xyz[hit], observed, camera)
+
+
+def estimate_at(
+    T_cw: Matrix,
+    map_: Map,
+    landmarks: NDArray[np.int32],
+    seen: NDArray[np.bool_],
+    n_matches: int,
+    xyz: Matrix,
+    observed: tuple[Matrix, Matrix],
+    camera: Camera,
+) -> PoseEstimate:
+    """Return the estimate whose pose was optimised with some observations.
+
+    Args:
+        T_cw: ``(4, 4)`` optimised pose (world to camera).
+        landmarks, seen, n_matches: see ``PoseEstimate``. Landmarks outside the image are left out.
+        xyz, observed: ``(N, 3)`` positions of the inliers in the world frame, and their
+            observations, from ``observations``.
+    """
+    covariance = pose_covariance(
+        T_cw, xyz, *observed, camera.intrinsics, np.full(len(xyz), camera.intrinsics[5])
+    )
+    expected = project(map_.arrays.xyz[landmarks], T_cw, camera)
     visible = np.flatnonzero(np.isfinite(expected[:, 0]))
     return PoseEstimate(
-        landmarks[visible], expected[visible], seen[visible], len(hit), T_cw, covariance
+        landmarks[visible], expected[visible], seen[visible], n_matches, T_cw, covariance
     )
 
 
@@ -196,10 +214,16 @@ def project(xyz: Matrix, T_cw: Matrix, camera: Camera) -> Matrix:
 
 
 def _observed(uv: Matrix, query: DescriptorMaps) -> tuple[Matrix, Matrix]:
+    return observations(uv, SIGMA / query.scale)
+
+
+def observations(uv: Matrix, sigma: float) -> tuple[Matrix, Matrix]:
     """Convert ``(N, 2)`` pixels to monocular observations.
+
+    Args:
+        sigma: standard deviation of u and v, in pixels.
 
     Returns:
         ``(N, 3)`` u, v, u_right, where u_right is NaN, and ``(N,)`` inverse variances of u and v.
     """
-    sigma = SIGMA / query.scale
     return stack_uvr(uv, np.full(len(uv), np.nan)), np.full(len(uv), sigma**-2.0)

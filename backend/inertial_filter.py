@@ -18,6 +18,7 @@ import numpy as np
 
 from vslam.backend.preintegration import (
     Preintegration,
+    cross_matrix,
     preintegrate,
     right_jacobian,
     so3_exp,
@@ -85,10 +86,10 @@ def moved(state: InertialState, motion: Preintegration, noise: ImuNoise) -> Iner
     F, by_bias = np.eye(N), motion.by_bias
     F[TURN, TURN] = motion.rotation.T
     F[TURN, BIAS] = by_bias[:3]
-    F[SPEED, TURN] = -R @ _cross_matrix(motion.velocity)
+    F[SPEED, TURN] = -R @ cross_matrix(motion.velocity)
     F[SPEED, FALL] = t * np.eye(3)
     F[SPEED, BIAS] = R @ by_bias[3:6]
-    F[PLACE, TURN] = -R @ _cross_matrix(motion.position)
+    F[PLACE, TURN] = -R @ cross_matrix(motion.position)
     F[PLACE, SPEED] = t * np.eye(3)
     F[PLACE, FALL] = 0.5 * t * t * np.eye(3)
     F[PLACE, BIAS] = R @ by_bias[6:]
@@ -127,7 +128,7 @@ def corrected_by_pose(
     A = np.zeros((6, 6))  # from xi to the rotation of the IMU, and its position in the world
     A[:3, 3:] = R_imu_camera
     A[3:, :3] = R @ R_imu_camera
-    A[3:, 3:] = R @ _cross_matrix(arm) @ R_imu_camera
+    A[3:, 3:] = R @ cross_matrix(arm) @ R_imu_camera
     error = np.concatenate(
         [
             so3_log(np.ascontiguousarray(R.T @ T_measured[:3, :3])),
@@ -187,8 +188,8 @@ def anchored(state: InertialState, T_world_imu: Matrix) -> InertialState:
     """
     R, F = state.T_world_imu[:3, :3], np.eye(N)
     F[TURN] = F[PLACE] = 0.0
-    F[SPEED, TURN] = _cross_matrix(state.velocity) @ R
-    F[FALL, TURN] = _cross_matrix(state.gravity) @ R
+    F[SPEED, TURN] = cross_matrix(state.velocity) @ R
+    F[FALL, TURN] = cross_matrix(state.gravity) @ R
     T_new_world = T_world_imu @ inverse(state.T_world_imu)
     known = replace(state, covariance=F @ state.covariance @ F.T)
     return in_another_world(known, T_new_world)
@@ -218,7 +219,3 @@ def _corrected(state: InertialState, H: Matrix, error: Matrix, noise: Matrix) ->
         0.5 * (P + P.T),
     )
     return Correction(corrected, float(error @ np.linalg.solve(S, error)))
-
-
-def _cross_matrix(v: Matrix) -> Matrix:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

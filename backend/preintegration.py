@@ -189,8 +189,9 @@ def _times(A: Matrix, B: Matrix) -> Matrix:
     return C
 
 
-@inner_kernel
-def _cross_matrix(v: Matrix) -> Matrix:
+@kernel
+def cross_matrix(v: Matrix) -> Matrix:
+    """Return the ``(3, 3)`` matrix of the cross product with a ``(3,)`` vector."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
@@ -234,7 +235,7 @@ def _integrate(
 
         half = _times(R, so3_exp(0.5 * h * w))  # the orientation in the middle
         turn = so3_exp(h * w)
-        force = _times(half, _cross_matrix(a))
+        force = _times(half, cross_matrix(a))
         by_angle = _times(force, so3_exp(-0.5 * h * w))
         by_rate = _times(force, right_jacobian(0.5 * h * w))
         by_turn = right_jacobian(h * w)

@@ -16,6 +16,7 @@ import numpy as np
 from vslam.calibration.documents import Document
 from vslam.calibration.models import Array
 from vslam.support.errors import InputError
+from vslam.types.geometry import inverse
 from vslam.types.imu import ImuCalibration, ImuNoise
 
 NOISE_KEYS = {
@@ -82,13 +83,12 @@ def read_imu(
     if "cam0" in first:
         section = first.section("cam0")
         if "T_cam_imu" in section:
-            T = _inverted(section.matrix("T_cam_imu", 4, 4), section.source, "T_cam_imu")
+            T = inverse(_checked(section.matrix("T_cam_imu", 4, 4), section.source, "T_cam_imu"))
         elif "T_imu_cam" in section:
             T = _checked(section.matrix("T_imu_cam", 4, 4), section.source, "T_imu_cam")
     elif imus and "T_BS" in first and "T_BS" in imus[0]:
-        T_body_imu = imus[0].matrix("T_BS", 4, 4)
-        T_imu_body = _inverted(T_body_imu, imus[0].source, "T_BS")
-        T = T_imu_body @ _checked(first.matrix("T_BS", 4, 4), first.source, "T_BS")
+        T_body_imu = _checked(imus[0].matrix("T_BS", 4, 4), imus[0].source, "T_BS")
+        T = inverse(T_body_imu) @ _checked(first.matrix("T_BS", 4, 4), first.source, "T_BS")
     if T is None:
         return None, noise
     offset = _offset(section, "timeshift_cam_imu")
@@ -141,13 +141,6 @@ def _offset(section: Document, key: str) -> float:
             "get times of the IMU."
         )
     return offset
-
-
-def _inverted(T: Array, source: str, key: str) -> Array:
-    T = _checked(T, source, key)
-    inverse = np.eye(4)
-    inverse[:3, :3], inverse[:3, 3] = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
-    return inverse
 
 
 def _checked(T: Array, source: str, key: str) -> Array:

@@ -12,7 +12,6 @@ from vslam.frontend.track import By, Prediction, Track
 from vslam.frontend.tracking import uncertainty_of
 from vslam.method.inertia import (
     CARRIED_S,
-    Inertia,
     lost,
     predicted_covariance,
     predicted_motion,
@@ -32,7 +31,7 @@ from vslam.types.geometry import (
     se3_exp,
     se3_log,
 )
-from vslam.types.imu import ImuCalibration, InertialState
+from vslam.types.imu import ImuCalibration, Inertia, InertialState
 from vslam.types.map_view import MapView
 from vslam.types.odometry import Odometry, OdometryState
 from vslam.types.states import Standstill

@@ -34,10 +34,12 @@ from vslam.run import pipeline as run_pipeline
 from vslam.run import recorder, warmup
 from vslam.run.autosave import MAP
 from vslam.run.moments import MomentRecorder
+from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 from vslam.slam import Slam
 from vslam.support import machine
 from vslam.support.errors import InputError
+from vslam.support.options import options_of
 from vslam.types.features import TrackingState, TrackResult
 from vslam.types.loops import LoopEdge
 from vslam.types.trajectory import (
@@ -369,7 +371,7 @@ def test_a_name_like_no_other_is_told_of_none(call):
 
 
 def test_the_choices_of_detectors_are_those_of_the_registry():
-    assert get_args(options.DetectorName) == DETECTORS
+    assert dict(options_of(RunOptions))["detector"].choices() == DETECTORS
     assert get_args(train.NetworkName) == NETWORKS
 
 

@@ -11,7 +11,6 @@ import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import get_args
 from urllib.parse import unquote
 
 import numpy as np
@@ -109,12 +108,12 @@ def test_the_reference_has_every_command_and_option(site):
     from typer.main import get_command
 
     from vslam.cli.main import every_command
-    from vslam.cli.options import DetectorName
+    from vslam.loopclosure.names import detector_names
 
     text = (site / "reference" / "commands.html").read_text()
     run = get_command(every_command()).commands["run"]  # type: ignore[attr-defined]
     assert all(option in text for parameter in run.params for option in parameter.opts)
-    assert all(name in text for name in get_args(DetectorName))
+    assert all(name in text for name in detector_names())
     assert 'id="vslam-loops-bench"' in text
     assert "<p>Run SLAM on a sequence" in text
 

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 import typer
 from pydantic.fields import FieldInfo
 
-from vslam.loopclosure.names import detector_names
 from vslam.run.options import PERTURB, SEED, THRESHOLDS
 from vslam.support.errors import InputError
 from vslam.support.options import EXECUTION, INPUT, METHOD, OUTPUT, Option, options_of
@@ -22,12 +21,6 @@ if TYPE_CHECKING:
     from vslam.cli.console import Console
     from vslam.config import Config
     from vslam.datasets.frames import Source
-
-
-if TYPE_CHECKING:
-    DetectorName = str
-else:  # plug-ins can add names
-    DetectorName = Literal[detector_names()]
 
 
 def option(

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from vslam.config import Config
 from vslam.loopclosure.names import DEFAULT_DETECTOR, detector_names
 from vslam.support.errors import InputError
-from vslam.support.options import EXECUTION, INPUT, MAP, METHOD, Option, with_absolute_paths
+from vslam.support.options import EXECUTION, INPUT, MAP, METHOD, Option, with_paths
 from vslam.support.plugins import packages_of
 from vslam.types.source_options import SourceOptions
 
@@ -152,10 +152,7 @@ def write_options(folder: Path, options: RunOptions) -> None:
         InputError: the file cannot be written.
     """
     data = Path(options.data)
-    changed: dict[str, object] = {
-        name: path.resolve() if isinstance(path, Path) else tuple(one.resolve() for one in path)
-        for name, path in with_absolute_paths(options).items()
-    }
+    changed: dict[str, object] = with_paths(options, Path.resolve)
     if options.data and data.exists():
         changed["data"] = str(data.resolve())
     laws = (law.partition(":")[0] for law in options.perturb.split(","))

@@ -69,13 +69,13 @@ def words_of(given: BaseModel, without: tuple[str, ...] = ()) -> list[str]:
     return words
 
 
-def with_absolute_paths(given: BaseModel) -> dict[str, Any]:
-    """Return the fields that contain paths, with absolute paths."""
+def with_paths(given: BaseModel, convert: Callable[[Path], Path]) -> dict[str, Any]:
+    """Return the fields that contain paths, with converted paths, such as absolute ones."""
     found: dict[str, Any] = {}
     for name in type(given).model_fields:
         value = getattr(given, name)
         if isinstance(value, Path):
-            found[name] = value.absolute()
+            found[name] = convert(value)
         elif isinstance(value, tuple) and value and all(isinstance(one, Path) for one in value):
-            found[name] = tuple(one.absolute() for one in value)
+            found[name] = tuple(map(convert, value))
     return found

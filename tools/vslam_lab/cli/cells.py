@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from vslam.cli.console import Console
 from vslam.cli.options import kind_of_source, names_in, open_given, read_thresholds
 from vslam.support.errors import InputError, did_you_mean
-from vslam.support.options import with_absolute_paths, words_of
+from vslam.support.options import with_paths, words_of
 
 if TYPE_CHECKING:
     from vslam.datasets.frames import Source
@@ -219,7 +219,7 @@ def open_cells(
 
 
 def _absolute(given: SourceOptions) -> SourceOptions:
-    paths = with_absolute_paths(given)
+    paths = with_paths(given, Path.absolute)
     if given.data and Path(given.data).exists():
         paths["data"] = str(Path(given.data).absolute())
     return given.model_copy(update=paths)

@@ -9,9 +9,10 @@ import pytest
 from conftest import corridor_mipmaps, render
 from inertial import ADIS16448, Flight
 from scipy.spatial.transform import Rotation
+from source_files import run_source
 
 from vslam.config import Config
-from vslam.datasets.frames import Source, stored_frames
+from vslam.datasets.frames import Source, selected, stored_frames
 from vslam.datasets.imu import Imu
 from vslam.doctor.imu import examine_imu, measure_alignment
 from vslam.run.imu import usable_imu
@@ -127,6 +128,16 @@ def test_a_run_refuses_a_harmful_imu_in_one_sentence(drive, change, said):
     assert said in warning
     assert warning.count(". ") == 0
     assert warning.endswith(".")
+
+
+def test_a_run_from_python_refuses_a_harmful_imu_as_well(drive):
+    outcome = run_source(
+        selected(with_imu(drive, rows=in_g(drive.imu.read().copy())), max_frames=2)
+    )
+    assert outcome.sequence.imu is None
+    assert [w for w in outcome.warnings if "because of its gravity" in w] != []
+    assert len(outcome.warnings) == len(set(outcome.warnings))
+    assert run_source(selected(drive, max_frames=2)).sequence.imu is drive.imu
 
 
 def test_a_run_goes_on_without_an_imu_that_cannot_be_read_or_has_no_place(drive):

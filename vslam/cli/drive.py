@@ -64,9 +64,9 @@ def drive(
     from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
     from vslam.run.autosave import MAP, FolderAutosave, remove_autosave
-    from vslam.run.imu import usable_imu
+    from vslam.run.imu import imu_of
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
-    from vslam.run.pipeline import begin, imu_of, run_sequence
+    from vslam.run.pipeline import begin, run_sequence
 
     effective = {"perturb": perturbation.name, "realtime": options.realtime or source.live}
     settings = options.model_copy(update=effective)
@@ -74,8 +74,6 @@ def drive(
         unfinished = _unfinished(options, source, resume, lock)
         _compile(settings, console)
         saved = None if unfinished is None else unfinished.map
-        imu, notes = usable_imu(source)
-        source = replace(source, imu=imu, warnings=(*source.warnings, *notes))
         slam = begin(source.camera, settings, saved, imu_of(source))
         viewer = _viewer(output, console)
         if unfinished is not None:

@@ -24,6 +24,7 @@ from vslam.datasets.times import jitter_warnings
 from vslam.loopclosure.registry import detector_with_images, problem_of
 from vslam.maps.storage import made_with
 from vslam.run.autosave import NO_AUTOSAVE, Autosave, Unfinished
+from vslam.run.imu import with_usable_imu
 from vslam.run.moving_objects import moving_object_warnings
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome, causal_trajectory, ground_truth_of
@@ -68,6 +69,8 @@ def run_sequence(
     A frame that cannot be read is skipped. This frame gets a predicted pose, counts as lost and is
     listed in the outcome. A frame that is dropped in a real-time run gets an interpolated pose.
 
+    An IMU that would harm is not used, and a warning of the outcome says why (``usable_imu``).
+
     The run ends early after Ctrl-C, when the source ends unexpectedly, or when a component fails,
     for example the loop detector of a plug-in. All results obtained so far are kept. If mapping
     failed, the outcome contains no map, and the poses are those at the time of tracking.
@@ -79,8 +82,8 @@ def run_sequence(
     Args:
         resume: the saved state of an interrupted run, after which the run continues. The outcome
             covers the frames before and after the interruption.
-        slam: the result of ``begin`` for the same settings. If it is None, this function calls
-            ``begin``.
+        slam: the result of ``begin`` for the same settings and the IMU that ``imu_of`` returns.
+            If it is None, this function calls ``begin``.
 
     Raises:
         InputError: the images cannot be read, the images are not those of the resumed run, or
@@ -88,8 +91,9 @@ def run_sequence(
             the run early.
     """
     cv2.setNumThreads(1)  # the thread pool already uses all cores
-    imu, saved = imu_of(sequence), None if resume is None else resume.map
-    feed = None if sequence.imu is None or imu is None else ImuFeed(sequence.imu)
+    sequence, saved = with_usable_imu(sequence), None if resume is None else resume.map
+    feed = None if sequence.imu is None else ImuFeed(sequence.imu)
+    imu = None if sequence.imu is None else sequence.imu.calibration
     slam = slam or begin(sequence.camera, settings, saved, imu)
     perturbation = perturbation.bound_to(sequence)
     pair = PairCheck(sequence.camera, sequence.dataset, settings)
@@ -456,11 +460,6 @@ def _with_earlier(
         for one in before.corrections
     ]
     return loops + slam.loops, corrections + slam.corrections, np.concatenate([frames, extra])
-
-
-def imu_of(sequence: Source) -> ImuCalibration | None:
-    """Return the calibration of the IMU that a run uses; None if it uses none."""
-    return None if sequence.imu is None else sequence.imu.calibration
 
 
 def begin(

@@ -64,7 +64,8 @@ def write_card(card: dict[str, Any], weights: Path) -> tuple[Path, Path]:
     """Write a model card as ``NAME.json`` and ``NAME.md`` next to the weights. Returns the paths of
     both files."""
     figures = "".join(f"| {k} | {v:.4g} |\n" for k, v in card["validation"].items())
-    sources = "".join(f"| {k} | {v} |\n" for k, v in card["sources"].items())
+    sources = ", ".join(f"{k} ({v})" for k, v in card["sources"].items())
+    paths = weights.with_suffix(".json"), weights.with_suffix(".md")
     text = (
         f"# {card['network']}\n\n"
         f"{card['parameters']:,} parameters, descriptor of {card['dimensions']} numbers. Preset "
@@ -76,11 +77,9 @@ def write_card(card: dict[str, Any], weights: Path) -> tuple[Path, Path]:
         f"All pairs with a known relation are used.\n\n| figure | value |\n|---|---|\n{figures}\n"
         f"## Data\n\nTrained on {card['images_trained']} images, validated on "
         f"{card['images_validated']}. Division: {card['division']}. No test data were used.\n\n"
-        f"| source | images |\n|---|---|\n{sources}\n"
-        "Command: " + " ".join(f"`--data {spec}`" for spec in card["data"]) + "\n\n"
-        f"## Settings\n\n```json\n{json.dumps(card['settings'], indent=1)}\n```\n"
+        f"Images of each source: {sources}.\n\n"
+        f"`{paths[0].name}` has the settings and the values of `--data`.\n"
     )
-    paths = weights.with_suffix(".json"), weights.with_suffix(".md")
     write_file(paths[0], json.dumps(card, indent=2) + "\n")
     write_file(paths[1], text)
     return paths

@@ -29,6 +29,7 @@ MODULES = (
     "vslam.calibration.models",
     "vslam.loopclosure.detector",
     "vslam.loopclosure.registry",
+    "vslam.run.slam_run",
     "vslam.run.pipeline",
     "vslam.run.outcome",
     "vslam.evaluation.trajectories",

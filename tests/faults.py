@@ -117,7 +117,7 @@ POINTS = (
     Point("loop pictures", "vslam.run.moments.loop_matches", 1, ON),
     Point("closing the map", "vslam.method.closing.LoopClosing.conclude", 1, MAPLESS),
     Point("final trajectory", "vslam.method.published_map.PublishedMap.trajectory", 1, EARLY),
-    Point("check of the rig", "vslam.run.pipeline.measure_offset", 1, ON),
+    Point("check of the rig", "vslam.run.slam_run.measure_offset", 1, ON),
     Point("result: KITTI poses", "vslam.report.folder.write_kitti", 1, MISSING,
           ("trajectory_kitti.txt",)),
     Point("result: TUM poses", "vslam.report.folder.write_tum", 1, MISSING, ("trajectory.tum",)),

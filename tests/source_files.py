@@ -15,6 +15,7 @@ from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.run.slam_run import begin
 from vslam.types.camera import Camera
 from vslam.types.source_options import SourceOptions
 
@@ -240,4 +241,4 @@ def source_path(root: Path, kind: str) -> Path:
 
 def run_source(source, *, threads: int = 2, perturb: str = "none", **more) -> RunOutcome:
     settings = RunOptions(detector="none", perturb=perturb, threads=threads, **more)
-    return run_sequence(source, parse_perturbation(perturb, 0), settings, Recorder())
+    return run_sequence(begin(source, settings), parse_perturbation(perturb, 0), Recorder())

@@ -25,7 +25,7 @@ from typing import Any
 
 # The functions of each stage, as pairs: module, and NAME or CLASS.NAME.
 STAGES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
-    ("start: vocabulary", (("vslam.run.pipeline", "detector_with_images"),)),
+    ("start: vocabulary", (("vslam.run.slam_run", "detector_with_images"),)),
     ("read images", (("vslam.datasets.image_files", "read_grey"),)),
     (
         "pyramids",

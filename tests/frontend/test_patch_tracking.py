@@ -22,6 +22,7 @@ from vslam.frontend.tracking import feature_depth
 from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.run.slam_run import begin
 from vslam.slam import Slam
 from vslam.support.errors import UnreadableImageError
 from vslam.types.context import Context
@@ -209,7 +210,7 @@ def run(kitti_tree, threads=1, sequence=None):
     sequence = replace(sequence, stored=tuple(map(counted, sequence.stored)))
     settings = RunOptions(detector="none", threads=threads, thresholds=CONFIG)
     with patch("vslam.run.pair.PairCheck.watch", lambda self, frames: frames):
-        outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
+        outcome = run_sequence(begin(sequence, settings), Perturbation("none"), Recorder())
     return outcome, reads
 
 

@@ -38,9 +38,10 @@ from vslam.run.autosave import (
 )
 from vslam.run.options import RunOptions, read_options, write_options
 from vslam.run.outcome import RunOutcome, ground_truth_of
-from vslam.run.pipeline import _with_earlier, run_sequence
+from vslam.run.pipeline import run_sequence
 from vslam.run.progress import Progress, TrackLog, TrackTable, read_progress, write_progress
 from vslam.run.recorder import Recorder
+from vslam.run.slam_run import _with_earlier, begin
 from vslam.slam import Slam
 from vslam.support.errors import InputError
 from vslam.types.features import TrackingState, TrackResult
@@ -78,15 +79,8 @@ def drive(
     sequence = change(open_sequence("kitti", root, "00"))
     settings = RunOptions(detector="bow", threads=2, thresholds=config, compare=compare)
     autosave = {} if folder is None else {"autosave": FolderAutosave(folder, 1e-6, "kitti 00")}
-    return run_sequence(
-        sequence,
-        parse_perturbation(law, 0),
-        settings,
-        Recorder(),
-        resume=resume,
-        **autosave,
-        **options,
-    )
+    begun = begin(sequence, settings, resume)
+    return run_sequence(begun, parse_perturbation(law, 0), Recorder(), **autosave, **options)
 
 
 @pytest.fixture(scope="module")

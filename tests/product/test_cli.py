@@ -31,7 +31,7 @@ from vslam.report.folder import write_results
 from vslam.report.run_page import option_rows
 from vslam.report.schema import ReportJson
 from vslam.run import pipeline as run_pipeline
-from vslam.run import recorder, warmup
+from vslam.run import recorder, slam_run, warmup
 from vslam.run.autosave import MAP
 from vslam.run.moments import MomentRecorder
 from vslam.run.options import RunOptions
@@ -436,9 +436,8 @@ def pipeline(monkeypatch) -> SimpleNamespace:
     """A replacement of SLAM that returns a shifted ground truth and records its arguments."""
     calls = SimpleNamespace(interrupted=None, loops=[], lost=False)
 
-    def run_sequence(
-        sequence, perturbation, settings, recorder, on_frame, autosave=None, resume=None, slam=None
-    ):
+    def run_sequence(run, perturbation, recorder, on_frame, autosave=None):
+        sequence, settings = run.source, run.settings
         T_wc = circle(len(sequence))  # the ground truth, if there is one
         T_wc[:, 1, 3] += 2.0
         tracks = [fake_result(k, T_wc[k]) for k in range(len(sequence))]
@@ -448,14 +447,9 @@ def pipeline(monkeypatch) -> SimpleNamespace:
             on_frame(track)
         trajectory = Trajectory(sequence.timestamps, T_wc)
         compared = [
-            run_sequence(
-                sequence,
-                perturbation,
-                settings.model_copy(update={"detector": name, "compare": ()}),
-                recorder,
-                lambda track: None,
-            )
+            run_sequence(begin(sequence, one), perturbation, recorder, lambda track: None)
             for name in settings.compare
+            for one in [settings.model_copy(update={"detector": name, "compare": ()})]
         ]
         calls.settings, calls.recorder = settings, recorder
         if calls.interrupted:
@@ -469,12 +463,15 @@ def pipeline(monkeypatch) -> SimpleNamespace:
             compared=tuple(replace(one, trajectory=shaken(one.trajectory)) for one in compared),
         )  # fmt: skip
 
+    def begin(source, settings, resume=None):
+        return SimpleNamespace(source=source, settings=settings)
+
     def draw_figures(outcome, evaluation, verdict):
         calls.evaluation, calls.outcome = evaluation, outcome
         return []  # drawing takes a second
 
     monkeypatch.setattr(run_pipeline, "run_sequence", run_sequence)
-    monkeypatch.setattr(run_pipeline, "begin", lambda *given: None)
+    monkeypatch.setattr(slam_run, "begin", begin)
     monkeypatch.setattr(recorder, "Recorder", lambda: "null")
     monkeypatch.setattr(recorder, "RerunRecorder", lambda target, pictures: str(target))
     monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[1])

@@ -19,6 +19,7 @@ from vslam.datasets.perturbation import Perturbation
 from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.run.slam_run import begin
 from vslam.slam import Slam
 from vslam.support.errors import InputError, UnreadableImageError
 from vslam.types.features import TrackingState
@@ -304,6 +305,8 @@ def test_the_real_vehicle_stands_still_through_the_dark_by_its_imu():
 def test_the_real_vehicle_stands_still():
     sequence = open_euroc(REAL, "", start=21, max_frames=25)
     assert sequence.ground_truth is not None
-    outcome = run_sequence(sequence, Perturbation("none"), RunOptions(detector="none"), Recorder())
+    outcome = run_sequence(
+        begin(sequence, RunOptions(detector="none")), Perturbation("none"), Recorder()
+    )
     moved = np.linalg.norm(outcome.trajectory.T_wc[:, :3, 3], axis=1)
     assert moved.max() < 0.005

@@ -13,6 +13,7 @@ from vslam.evaluation.loops import evaluate_loops
 from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.run.slam_run import begin
 from vslam.slam import Slam
 
 pytestmark = pytest.mark.slow
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.slow
 def compared(round_the_block):
     """The drive with the default detector, which is compared with ``bow``."""
     settings = RunOptions(threads=2, compare=("bow",))
-    return run_sequence(round_the_block, parse_perturbation("none", 0), settings, Recorder())
+    return run_sequence(begin(round_the_block, settings), parse_perturbation("none", 0), Recorder())
 
 
 def test_the_default_closes_a_loop_by_night_that_the_bag_of_words_misses(compared):

@@ -22,6 +22,7 @@ from vslam.report.frame_table import write_covariances, write_frames
 from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.run.slam_run import begin
 from vslam.slam import Slam
 from vslam.types.features import Extracted, TrackingState, TrackResult
 from vslam.types.geometry import adjoint, inverse, se3_exp, se3_log
@@ -380,7 +381,9 @@ def test_numbers_come_back_as_the_same_uncertainty():
 
 def test_the_report_draws_the_error_of_odometry_beside_two_sigma(kitti_tree):
     sequence = open_sequence("kitti", kitti_tree, "00")
-    outcome = run_sequence(sequence, Perturbation("none"), RunOptions(detector="none"), Recorder())
+    outcome = run_sequence(
+        begin(sequence, RunOptions(detector="none")), Perturbation("none"), Recorder()
+    )
     errors = motion_errors(outcome.tracks, outcome.ground_truth, 1.0)
     assert len(errors.first) == 18  # of 28 frames in 2.7 s
     assert errors.distance.max() < 0.05

@@ -29,9 +29,10 @@ from vslam.maps.storage import load_map, save_map
 from vslam.maps.stored_map import StoredMap
 from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
-from vslam.run.pipeline import _record_loops, mistracked_warnings, run_sequence
+from vslam.run.pipeline import _record_loops, run_sequence
 from vslam.run.preparation import prepare_frame
 from vslam.run.recorder import Recorder
+from vslam.run.slam_run import begin, mistracked_warnings
 from vslam.types.context import Context
 from vslam.types.features import TrackingState
 from vslam.types.loops import LoopEdge
@@ -47,7 +48,7 @@ def run(root: Path, sequence: str = "00", *, threads: int = 2, perturb: str = "n
     frames = open_sequence("kitti", root, sequence, max_frames=max_frames)
     perturbation = parse_perturbation(perturb, seed)
     settings = RunOptions(detector=detector, threads=threads, compare=compare)
-    return run_sequence(frames, perturbation, settings, Recorder(), **options)
+    return run_sequence(begin(frames, settings), perturbation, Recorder(), **options)
 
 
 def vslam(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -67,7 +68,7 @@ def test_a_run_warns_of_the_calibration_of_other_images(kitti_tree):
     twice = replace(c, fx=2 * c.fx, fy=2 * c.fy, cx=2 * c.cx, cy=2 * c.cy)
     settings = RunOptions(detector="none", calib=(Path("a.yaml"),))
     source = replace(frames, camera=twice)
-    outcome = run_sequence(source, parse_perturbation("none", 0), settings, Recorder())
+    outcome = run_sequence(begin(source, settings), parse_perturbation("none", 0), Recorder())
     (said,) = outcome.warnings
     assert said.startswith("a.yaml: the principal point")
     assert "images of twice this size" in said

@@ -22,6 +22,7 @@ from vslam.run.options import RunOptions
 from vslam.run.pipeline import run_sequence
 from vslam.run.preparation import play
 from vslam.run.recorder import Recorder
+from vslam.run.slam_run import begin
 from vslam.slam import Slam
 from vslam.types.features import TrackingState
 
@@ -161,7 +162,7 @@ def test_frames_that_were_dropped_are_not_lost(corridor, check_map):
 def test_one_camera_in_real_time(kitti_tree, threads):
     sequence = open_sequence("kitti", kitti_tree, "00", max_frames=6, monocular=True)
     settings = RunOptions(detector="none", threads=threads, realtime=True)
-    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
+    outcome = run_sequence(begin(sequence, settings), Perturbation("none"), Recorder())
     assert len(outcome.tracks) == 6
     assert len(outcome.latency_ms) == sum(track.n_features > 0 for track in outcome.tracks) > 0
 
@@ -175,7 +176,7 @@ def test_an_unreadable_image_in_real_time(kitti_tree, threads, tmp_path):
     image.write_bytes(image.read_bytes()[:2000])
     sequence = open_sequence("kitti", root, "00", max_frames=6)
     settings = RunOptions(detector="none", threads=threads, realtime=True)
-    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
+    outcome = run_sequence(begin(sequence, settings), Perturbation("none"), Recorder())
     assert len(outcome.trajectory) == len(outcome.tracks) == 6
     assert outcome.tracks[5].state == TrackingState.LOST
     assert [str(image) in message for message in outcome.skipped] == [True]
@@ -185,7 +186,7 @@ def test_a_compared_detector_drops_the_frames_that_the_main_one_drops(kitti_tree
     """With a live camera, this must be the case, because each frame arrives only once."""
     sequence = open_sequence("kitti", kitti_tree, "00", max_frames=8)
     settings = RunOptions(detector="bow", threads=2, realtime=True, compare=("none",))
-    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
+    outcome = run_sequence(begin(sequence, settings), Perturbation("none"), Recorder())
     (other,) = outcome.compared
     assert len(outcome.tracks) == len(other.tracks) == 8
     for own, compared in zip(outcome.tracks, other.tracks, strict=True):

@@ -26,6 +26,7 @@ from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.run.slam_run import begin
 from vslam.slam import Slam
 from vslam.support.errors import InputError, UnreadableImageError
 from vslam.types.camera import Camera
@@ -95,7 +96,7 @@ def refused(root: Path, *parts: str, **options) -> None:
 def run_on(tree: Path, *, threads: int = 1, **options) -> RunOutcome:
     sequence = open_tum(tree, "", **options)
     settings = RunOptions(detector="bow", threads=threads)
-    return run_sequence(sequence, parse_perturbation("none", 0), settings, Recorder())
+    return run_sequence(begin(sequence, settings), parse_perturbation("none", 0), Recorder())
 
 
 def ate_of(outcome: RunOutcome) -> float:

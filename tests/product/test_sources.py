@@ -47,6 +47,7 @@ from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.run.slam_run import begin
 from vslam.support.errors import InputError
 from vslam.types.camera import Camera
 from vslam.types.features import TrackingState
@@ -375,7 +376,7 @@ def test_ctrl_c_is_the_regular_end_of_a_camera(folder, corridor, monkeypatch):
             signal.raise_signal(signal.SIGINT)
 
     law = parse_perturbation("brightness", 0)
-    outcome = run_sequence(source, law, settings, Recorder(), on_frame=on_frame)
+    outcome = run_sequence(begin(source, settings), law, Recorder(), on_frame=on_frame)
     assert outcome.interrupted is None
     assert len(outcome.trajectory) == len(outcome.tracks) >= 31
     assert TrackingState.DROPPED in {track.state for track in outcome.tracks}

@@ -21,6 +21,7 @@ from vslam.report.folder import create_run_folder, write_results
 from vslam.run.options import RunOptions, read_options
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.run.slam_run import begin
 from vslam.support import plugins
 from vslam.support.errors import BrokenSourceError, InputError, UnreadableImageError
 from vslam.types.features import Features
@@ -286,7 +287,7 @@ def test_a_detector_that_fails_ends_the_run_with_what_it_has(broken, kitti_tree,
     broken(FAILING, "[vslam.detectors]\nmine = broken:Detector\n")
     sequence = open_sequence("kitti", kitti_tree, "00")
     settings = RunOptions(detector="mine", threads=threads)
-    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
+    outcome = run_sequence(begin(sequence, settings), Perturbation("none"), Recorder())
     assert outcome.interrupted is not None
     assert outcome.interrupted.startswith("the detector mine of the package broken 2.0 failed")
     assert "RuntimeError: out of memory" in outcome.interrupted
@@ -302,7 +303,7 @@ def test_a_compared_detector_that_fails_ends_alone(broken, kitti_tree, tmp_path,
     broken(FAILING, "[vslam.detectors]\nmine = broken:Detector\n")
     sequence = open_sequence("kitti", kitti_tree, "00")
     settings = RunOptions(detector="none", threads=threads, compare=("mine",))
-    outcome = run_sequence(sequence, Perturbation("none"), settings, Recorder())
+    outcome = run_sequence(begin(sequence, settings), Perturbation("none"), Recorder())
     assert outcome.interrupted is None
     assert len(outcome.trajectory) == len(sequence)
     assert 3 <= len(outcome.compared[0].trajectory) <= len(sequence)
@@ -399,7 +400,7 @@ def test_a_run_on_a_reader_that_streams(broken, kitti_tree):
     broken(STREAM.replace("LIVE", "False"), "[vslam.readers]\nmine = broken:reader\n")
     source = open_from("mine", kitti_tree, max_frames=6)
     settings = RunOptions(detector="none")
-    outcome = run_sequence(source, Perturbation("none"), settings, Recorder())
+    outcome = run_sequence(begin(source, settings), Perturbation("none"), Recorder())
     assert len(outcome.trajectory) == 6
 
 

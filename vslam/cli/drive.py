@@ -64,17 +64,16 @@ def drive(
     from vslam.doctor.nothing_tracked import why_nothing_was_tracked
     from vslam.report.folder import write_results
     from vslam.run.autosave import MAP, FolderAutosave, remove_autosave
-    from vslam.run.imu import imu_of
     from vslam.run.moments import LoopPictureRecorder, MomentRecorder
-    from vslam.run.pipeline import begin, run_sequence
+    from vslam.run.pipeline import run_sequence
+    from vslam.run.slam_run import begin
 
     effective = {"perturb": perturbation.name, "realtime": options.realtime or source.live}
     settings = options.model_copy(update=effective)
     with ExitStack() as lock:
         unfinished = _unfinished(options, source, resume, lock)
         _compile(settings, console)
-        saved = None if unfinished is None else unfinished.map
-        slam = begin(source.camera, settings, saved, imu_of(source))
+        run = begin(source, settings, unfinished)
         viewer = _viewer(output, console)
         if unfinished is not None:
             console.announce(f"continuing at frame {len(unfinished.progress.tracks)} ...")
@@ -86,9 +85,8 @@ def drive(
         autosave = FolderAutosave(folder, period, f"{source.dataset} {source.name}")
         with console.progress_bar(source.n_expected) as on_frame:
             outcome = run_sequence(
-                source, perturbation, settings, recorder,
-                on_frame=on_frame, autosave=autosave, resume=unfinished, slam=slam,
-            )  # fmt: skip
+                run, perturbation, recorder, on_frame=on_frame, autosave=autosave
+            )
         gps_error = ""
         if fixes is not None:
             outcome, gps_error = _georeferenced(outcome, fixes)

@@ -10,7 +10,6 @@ from vslam.datasets.frames import Source
 from vslam.datasets.imu import Imu
 from vslam.run.imu_checks import check_samples
 from vslam.support.errors import InputError
-from vslam.types.imu import ImuCalibration
 
 _COVERED = 0.5  # share of the frames that must lie between the first and the last sample
 
@@ -19,12 +18,6 @@ def with_usable_imu(source: Source) -> Source:
     """Return a source without an IMU that would harm, and with warnings that say why."""
     imu, notes = usable_imu(source)
     return replace(source, imu=imu, warnings=(*source.warnings, *notes))
-
-
-def imu_of(source: Source) -> ImuCalibration | None:
-    """Return the calibration of the IMU that a run of a source uses; None if it uses none."""
-    imu, _ = usable_imu(source)
-    return None if imu is None else imu.calibration
 
 
 def usable_imu(source: Source) -> tuple[Imu | None, list[str]]:

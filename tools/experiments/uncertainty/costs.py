@@ -29,6 +29,7 @@ from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 from vslam.run.pipeline import run_sequence
 from vslam.run.recorder import Recorder
+from vslam.run.slam_run import begin
 from vslam.types.odometry import Odometry
 
 
@@ -73,7 +74,7 @@ def run(options: argparse.Namespace, mask: Path | None) -> RunOutcome:
         data=options.data, dataset="kitti", seq=options.seq, max_frames=options.frames, mask=mask,
         detector="none",
     )  # fmt: skip
-    return run_sequence(open_source(given), parse_perturbation("none", 0), given, Recorder())
+    return run_sequence(begin(open_source(given), given), parse_perturbation("none", 0), Recorder())
 
 
 def timed(function: Callable[..., Any], times: list[float]) -> Callable[..., Any]:

@@ -110,7 +110,7 @@ def entry(
 
 
 def table_of(report: OverviewJson, title: str) -> Table:
-    (section,) = (one for one in overview_page(report, []).sections if one.title == title)
+    (section,) = (one for one in overview_page(report, [], {}).sections if one.title == title)
     (table,) = section.parts
     return table
 
@@ -728,6 +728,17 @@ def test_html_has_every_figure_and_loads_nothing(written):
     assert set(re.findall('<figure class="card ([^"]*)"', html)) == FIGURES
     assert html.count("<table") == 8
     assert not re.search("<(script|iframe|object|embed|img)", html)
+
+
+def test_the_page_links_the_page_of_each_run_that_has_one(run_folder: Path, tmp_path: Path):
+    with_page = copy_run(run_folder, tmp_path / "runs" / "a: 100%")
+    (with_page / "report.html").write_text("<h1>a</h1>")
+    copy_run(run_folder, tmp_path / "runs" / "b")
+    estimate = with_page / "trajectory_kitti.txt"
+    write_overview([tmp_path / "runs"], [f"ORB-SLAM3={estimate}"], tmp_path / "made" / "out")
+    text = (tmp_path / "made" / "out" / "report.html").read_text()
+    links = re.findall(r'<a href="([^"]+)">', text)
+    assert links == ["../../runs/a%3A%20100%25/report.html"]
 
 
 _PROBE = """<!doctype html><link rel="icon" href="data:,"><body>

@@ -22,12 +22,15 @@ class Table:
         rows: the cells. Each row has a cell for each column.
         texts: the headings of the columns that contain text. Text is aligned to the left.
         note: explanation below the table.
+        links: for each row, the address of a page to which HTML links the last cell; empty for no
+            link. If there are no links, this is empty.
     """
 
     head: Row
     rows: Sequence[Row]
     texts: Row = ()
     note: str = ""
+    links: Sequence[str] = ()
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vslam.cli.options import Quiet, flag, option
+from vslam.cli.options import Quiet, option
 from vslam.support.errors import counted
 from vslam.support.options import OUTPUT
 
@@ -15,7 +15,6 @@ _EXAMPLES = """
 [b]Examples[/b]
   vslam report bench
   vslam report runs/20261121-1* other/bench --baseline bow --out comparison
-  vslam report runs --serve
   vslam report bench --trajectory ORB-SLAM3@00=orbslam3/00.txt
 """
 
@@ -48,36 +47,10 @@ def report(
         ),
     ] = None,
     out: Annotated[Path, option(OUTPUT, "FOLDER", "Folder to write to.")] = Path("report"),
-    serve: Annotated[
-        bool,
-        flag(
-            OUTPUT,
-            "Instead of writing a report, serve a page of all runs to this machine only, until "
-            "Ctrl-C.",
-            "--serve",
-        ),
-    ] = False,
-    port: Annotated[
-        int, option(OUTPUT, "N", "Port of [b]--serve[/b].", min=0, max=65535, unset="a free one")
-    ] = 0,
     quiet: Quiet = False,
 ) -> None:
     """Compare finished runs in one report, with detectors side by side."""
-    if serve:
-        serve_runs(runs, port)
-        return
     write_overview_of(runs, trajectory or [], out, baseline=baseline, quiet=quiet)
-
-
-def serve_runs(folders: list[Path], port: int) -> None:
-    from vslam_lab.overview.serve import make_server
-
-    with make_server(folders, port) as server:
-        typer.echo(f"http://127.0.0.1:{server.server_port}/ shows the runs until Ctrl-C")
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            typer.echo("stopped")
 
 
 def write_overview_of(

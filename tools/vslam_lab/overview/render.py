@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import os
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from urllib.parse import quote
 
 from vslam.report.page import Bullets, Figure, Page, Pairs, Section, Table, number
 from vslam.report.render import csv_text, html, markdown, write_files
 from vslam.support.errors import counted
-from vslam_lab.overview.collect import collect
+from vslam_lab.overview.collect import Found, collect
 from vslam_lab.overview.figures import draw_overview
 from vslam_lab.overview.schema import DECIMALS, MEASURES, Measure, OverviewJson, RunEntry, Spread
 from vslam_lab.overview.summary import ALPHA, summarize
@@ -69,14 +71,20 @@ def write_overview(
     figures = draw_overview(report, found)
     notes = list(dict.fromkeys((*report.notes, *found.notes)))  # drawing can add notes
     report = report.model_copy(update={"notes": notes})
-    page = overview_page(report, figures)
+    page = overview_page(report, figures, _pages(found, out))
     files = {"report.json": report.to_json(), "table.csv": render_csv(report)}
     write_files(out, {**files, "report.md": markdown(page), "report.html": html(page)})
     return report
 
 
-def overview_page(report: OverviewJson, figures: Collection[Figure]) -> Page:
-    """Make the page of a report of many runs."""
+def overview_page(
+    report: OverviewJson, figures: Collection[Figure], pages: Mapping[str, str]
+) -> Page:
+    """Make the page of a report of many runs.
+
+    Args:
+        pages: address of the page of each run that has one, by ``RunEntry.source``.
+    """
     return Page(
         title(report),
         (f"vslam {report.versions.get('vslam', '')}", f"{report.created:%Y-%m-%d %H:%M %Z}"),
@@ -86,7 +94,7 @@ def overview_page(report: OverviewJson, figures: Collection[Figure]) -> Page:
             *_results(report),
             Section("", [*figures], wide=False),
             Section("Notes", [Bullets(report.notes)]),
-            _runs(report),
+            _runs(report, pages),
             Section("Provenance", [Pairs(_provenance(report))]),
         ),
     )
@@ -174,7 +182,18 @@ def _compared(report: OverviewJson) -> Section:
     return Section("Differences", [Table((*head, "winner"), rows, texts, _TESTED)])
 
 
-def _runs(report: OverviewJson) -> Section:
+def _pages(found: Found, out: Path) -> dict[str, str]:
+    """Return the address of the page of each run that has one, relative to the folder ``out``."""
+    pages = {}
+    for run in found.runs:
+        folder = found.estimate[run.source].parent.resolve()
+        if run.seed is not None and (folder / "report.html").is_file():
+            relative = Path(os.path.relpath(folder / "report.html", out.resolve()))
+            pages[run.source] = quote(relative.as_posix())
+    return pages
+
+
+def _runs(report: OverviewJson, pages: Mapping[str, str]) -> Section:
     head = ("sequence", "perturbation", "system", "seed", "frames", "ATE (m)", "run")
     rows: list[tuple[str, ...]] = [
         (
@@ -189,7 +208,8 @@ def _runs(report: OverviewJson) -> Section:
         for run in report.runs
     ]
     texts = ("sequence", "perturbation", "system", "run")
-    return Section("Runs", [Table(head, rows, texts)], folded=True)
+    links = [pages.get(run.source, "") for run in report.runs]
+    return Section("Runs", [Table(head, rows, texts, links=links)], folded=True)
 
 
 def _provenance(report: OverviewJson) -> list[tuple[str, str]]:

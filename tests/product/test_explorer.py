@@ -1,18 +1,11 @@
-"""The explorer of a report and the page of all runs, in a browser and at the width of a phone."""
+"""The explorer of a report, in a browser and at the width of a phone."""
 
 from __future__ import annotations
 
-import http.client
-import http.server
 import json
 import re
 import shutil
-import subprocess
-import sys
-import threading
 from base64 import b64decode
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -21,12 +14,9 @@ import pytest
 from browser import chromium, dumped
 from test_report import make_outcome
 
-from vslam.config import as_config
 from vslam.report.explorer import explorer_data
 from vslam.report.folder import evaluate_run, write_results
 from vslam.run.moments import MomentRecorder
-from vslam.support.errors import InputError
-from vslam_lab.overview.serve import list_runs, make_server
 
 FRAMES = 150
 
@@ -233,159 +223,3 @@ def test_the_page_is_one_file_of_bounded_size(run: Path):
     text = (run / "report.html").read_text()
     assert not re.findall(r"(?:src|href)=\"(?!data:|#)[^\"]+\"", text)
     assert len(text) < 2 * 10**6
-
-
-@pytest.fixture
-def server(run: Path, tmp_path: Path):
-    second = tmp_path / "<b>second"
-    second.mkdir()
-    write_results(second, make_outcome(20), pages=True)
-    bare = tmp_path / "bare"
-    bare.mkdir()
-    outcome = make_outcome(20)
-    thresholds = as_config({"orb.n_levels": 7})
-    settings = outcome.settings.model_copy(update={"thresholds": thresholds})
-    write_results(bare, replace(outcome, settings=settings), pages=False)
-    (tmp_path / "secret.html").write_text("secret")
-    made = make_server([run.parent, tmp_path])
-    threading.Thread(target=made.serve_forever, daemon=True).start()
-    yield made
-    made.shutdown()
-    made.server_close()
-
-
-def ask(server, path: str, host: str | None = None) -> tuple[int, str]:
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
-    headers = {"Host": host} if host else {}
-    connection.request("GET", path, headers=headers)
-    answer = connection.getresponse()
-    return answer.status, answer.read().decode()
-
-
-def test_the_list_links_every_run_that_has_a_page(server):
-    status, text = ask(server, "/")
-    assert status == 200
-    assert len(re.findall(r'href="/run/\d+"', text)) == 2
-    assert "&lt;b&gt;second" in text
-    assert "<b>second" not in text
-    assert ">bare<" in text
-    assert ">none, orb.n_levels=7<" in text
-    for link in re.findall(r'href="(/run/\d+)"', text):
-        status, page = ask(server, link)
-        assert status == 200
-        assert "<h1>" in page
-
-
-def test_runs_side_by_side(server):
-    status, text = ask(server, "/compare?run=0&run=1&run=1&run=99")
-    assert status == 200
-    assert re.findall(r'<iframe src="(/run/\d)"', text) == ["/run/0", "/run/1"]
-    assert ask(server, "/compare?run=0")[0] == 400
-
-
-def test_nothing_but_reports_is_served_and_to_nobody_else(server):
-    for path in ("/secret.html", "/../secret.html", "/run/../secret.html", "/run/-1", "/run/9",
-                 "/run/%2e%2e/secret.html", "/run/1/report.json",
-                 "/run/" + 5000 * "9"):  # fmt: skip
-        assert ask(server, path)[0] == 404, path
-    assert ask(server, "/", "evil.example:80")[0] == 403
-    assert ask(server, "/compare?run=0&run=" + 5000 * "9")[0] == 400
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
-    connection.putrequest("GET", "http://[x/", skip_host=True)  # not parsed here
-    connection.putheader("Host", "localhost")
-    connection.endheaders()
-    assert connection.getresponse().status == 400
-    assert ask(server, "/", f"localhost:{server.server_port}")[0] == 200
-    assert ask(server, "/", "localhost")[0] == 200  # without a port, as for port 80
-    assert server.server_address[0] == "127.0.0.1"
-
-
-def policy_of(server, path: str) -> str:
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
-    connection.request("GET", path)
-    return connection.getresponse().getheader("Content-Security-Policy") or ""
-
-
-def test_a_report_of_a_stranger_is_sandboxed(server):
-    """Its scripts have no origin. They can neither read other reports nor load anything."""
-    policy = policy_of(server, "/run/0").split("; ")
-    assert policy[:2] == ["sandbox allow-scripts", "default-src 'none'"]
-    for path in ("/", "/?x", "/compare?run=0&run=1"):
-        assert "sandbox" not in policy_of(server, path)
-        assert "default-src 'none'" in policy_of(server, path)
-        assert "script-src" not in policy_of(server, path)
-
-
-SPY = """<p id="said">nothing</p><script>
-said.textContent = "ran";
-for (const path of ["/", "/run/0", "/run/1"])
-  fetch(path).then(answer => answer.text()).then(text => { said.textContent = "read " + path; });
-</script>"""
-
-
-@pytest.mark.slow
-def test_a_script_in_a_report_reads_no_other_one(server, tmp_path: Path):
-    (tmp_path / "<b>second" / "report.html").write_text(SPY)
-    links = re.findall(r'href="(/run/\d)"[^>]*>&lt;b&gt;second', ask(server, "/")[1])
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--dump-dom",
-             "--virtual-time-budget=2000", f"--user-data-dir={tmp_path / 'profile'}"]  # fmt: skip
-    address = f"http://127.0.0.1:{server.server_port}{links[0]}"
-    shown = subprocess.run(
-        [chromium(), *flags, address], capture_output=True, text=True, timeout=180, check=True
-    )
-    assert '<p id="said">ran</p>' in shown.stdout
-
-
-@pytest.mark.parametrize("name", ["report.html", "report.json"])
-def test_a_report_that_is_a_link_out_of_its_folder_is_not_served(server, tmp_path: Path, name):
-    folder = tmp_path / "<b>second"
-    number = re.findall(r'href="/run/(\d)"[^>]*>&lt;b&gt;second', ask(server, "/")[1])[0]
-    (folder / name).rename(tmp_path / "elsewhere")
-    (folder / name).symlink_to(tmp_path / "elsewhere")
-    if name == "report.html":
-        assert ask(server, f"/run/{number}")[0] == 404
-    assert len(re.findall(r'href="/run/\d"', ask(server, "/")[1])) == 1
-
-
-def test_runs_may_go_while_they_are_served(tmp_path: Path):
-    folder = tmp_path / "runs" / "one"
-    folder.mkdir(parents=True)
-    write_results(folder, make_outcome(20), pages=False)
-    with make_server([tmp_path / "runs"]) as made:
-        threading.Thread(target=made.serve_forever, daemon=True).start()
-        assert ask(made, "/")[0] == 200
-        shutil.rmtree(tmp_path / "runs")
-        assert ask(made, "/") == (404, "the runs are gone")
-        made.shutdown()
-
-
-def test_what_cannot_be_served_is_said(tmp_path: Path, server):
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    with pytest.raises(InputError, match="no run here"):
-        list_runs([empty])
-    with pytest.raises(InputError, match="no such folder"):
-        make_server([tmp_path / "nowhere"])
-    with pytest.raises(InputError, match=r"--port \d+: cannot be opened"):
-        make_server([tmp_path], server.server_port)
-
-
-@pytest.mark.slow
-def test_the_command_serves_until_it_is_interrupted(run: Path):
-    import signal
-
-    command = [sys.executable, "-u", "-m", "vslam", "report", str(run.parent), "--serve"]
-    # A process that a shell starts in the background ignores SIGINT, and so do its children.
-    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=listen) as process:
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            port = int(re.match(r"http://127\.0\.0\.1:(\d+)/ shows", line)[1])
-            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
-            connection.request("GET", "/")
-            assert connection.getresponse().status == 200
-            process.send_signal(signal.SIGINT)
-            assert process.wait(60) == 0
-        finally:
-            process.kill()

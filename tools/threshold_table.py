@@ -26,31 +26,18 @@ DESCRIPTION = re.compile(
 )
 HEAD = """# Thresholds
 
-This page lists all thresholds of vslam. `python tools/threshold_table.py` generates it from `vslam/config.py`, and `tests/project/test_threshold_table.py` checks that the two agree. [The design](../explanation/design.md) describes the methods in which the thresholds are used. There are four ways to change thresholds:
+`vslam/config.py` has all thresholds, from which `python tools/threshold_table.py` writes this page. [The design](../explanation/design.md) describes the methods that use them. There are four ways to change them:
 
-- In a JSON file: `vslam run --config FILE`, with `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}` in the file.
 - On the command line: `vslam run --config orb.n_features=1500,tracking.method=patches`.
+- In a JSON file: `vslam run --config FILE`, with `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}` in it.
 - In Python: `Slam(camera, config={"orb.n_features": 1500})`.
-- With a [preset](#presets): `vslam run --config fast`, or `Slam(camera, config="fast")`. Single values can follow: `--config fast,orb.n_features=1000`.
+- With a [preset](#presets): `vslam run --config fast,orb.n_features=1000`, or `Slam(camera, config="fast")`.
 
-The column *source* names the paper and the section of the rule in which the threshold is used. It also states where the value comes from:
+*Source* names the paper and section of the rule, and where the value comes from: *printed* in this section, *customary* in the programs of the ORB-SLAM family or their configurations for KITTI, or our *own*. OS1 is Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2 is Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS is Zhou and Sun, Sci Rep 15, 7644 (2025).
 
-- *printed*: the value is printed in this section of the paper.
-- *customary*: the programs of the ORB-SLAM family use the value, or their configurations for KITTI.
-- *own*: we chose the value.
+Descriptors have 256 bits. Search radii at octave 0 grow with the scale of the pyramid level.
 
-OS1 is Mur-Artal et al., ORB-SLAM, T-RO 2015. OS2 is Mur-Artal and Tardós, ORB-SLAM2, T-RO 2017. ZS is Zhou and Sun, Sci Rep 15, 7644 (2025).
-
-Descriptor distances are upper bounds. A descriptor has 256 bits. Ratios of the best to the second-best distance are upper bounds, too. A search radius at octave 0 grows with the scale of the pyramid level.
-
-What nobody needs to tune is a constant beside the rule that uses it, with its source. They are mathematical constants, numerical tolerances, sizes of arrays and kernels, and numbers that belong to another constant or to trained weights. The most important ones are:
-
-- the chi-square quantiles,
-- the limit of 60 degrees for the viewing angle of a landmark (OS1 V-D),
-- the search radius, which is 1.6 times as wide for landmarks that are seen obliquely (OS1 V-D),
-- the distance range of a landmark, with a tolerance of 20 %,
-- the 30 bins of the orientation check,
-- the first 3 keyframes of a landmark, during which it can be culled as a recent landmark (OS1 VI-B).
+What nobody needs to tune is a constant beside the rule that uses it, with its source: for example, chi-square quantiles, the limit of 60 degrees for the viewing angle of a landmark (OS1 V-D), and the 20 % tolerance of its distance range.
 """  # noqa: E501
 
 

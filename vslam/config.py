@@ -39,232 +39,216 @@ class OrbConfig(Section):
     """ORB extraction."""
 
     n_features: int = Field(2000, ge=100)
-    """Number of features to extract from each image. More features make tracking more robust, but
-    slower. [OS1 V-A, printed]"""
+    """Features to extract from each image. More are more robust, but slower. [OS1 V-A, printed]"""
     n_levels: int = Field(8, ge=2, le=16)
-    """Number of levels of the image pyramid. With more levels, a landmark can be matched over a
-    larger range of distances. [OS1 V-A, printed]"""
+    """Levels of the image pyramid. With more, a landmark can be matched over a larger range of
+    distances. [OS1 V-A, printed]"""
     scale_factor: float = Field(1.2, gt=1.0, le=2.0)
     """Scale factor from one pyramid level to the next. [OS1 V-A, printed]"""
     fast_threshold: int = Field(12, ge=1, le=255)
-    """FAST threshold, in grey levels. A larger threshold finds fewer, stronger corners.
-    [OS1 V-A, customary]"""
+    """FAST threshold, in grey levels. A larger one finds fewer, stronger corners. [OS1 V-A,
+    customary]"""
     fast_threshold_min: int = Field(7, ge=1, le=255)
-    """FAST threshold in cells where `fast_threshold` finds no corner, in grey levels.
-    [OS1 V-A, customary]"""
+    """FAST threshold in cells where `fast_threshold` finds no corner, in grey levels. [OS1 V-A,
+    customary]"""
 
 
 class WeakImageConfig(Section):
     """Images with much noise or little contrast (docs/research/stress.md)."""
 
     noise_from: float = Field(5.0, ge=0)
-    """An image is blurred if the standard deviation of its noise is at least this value, in grey
-    levels. Images without added noise have at most 2.5. [own]"""
+    """An image is blurred from this standard deviation of its noise, in grey levels. Images without
+    added noise have at most 2.5. [own]"""
     spikes_from: float = Field(0.04, ge=0, le=1)
-    """A median filter is applied if more than this fraction of the pixels are spikes. A spike is a
-    pixel that is much brighter or much darker than both of its neighbours. [own]"""
+    """A median filter is applied above this fraction of spikes: pixels much brighter or darker than
+    both neighbours. [own]"""
     few_features: float = Field(0.5, ge=0, le=1)
-    """Contrast is measured only in images that yield fewer features than this fraction of
+    """Contrast is measured only in images with fewer features than this fraction of
     `orb.n_features`. [own]"""
     low_contrast: float = Field(6.0, ge=0)
-    """The contrast of an image is raised if it is below this value, in grey levels. With 0, the
-    contrast is never raised. To measure the contrast, the image is divided into blocks of 16 x 16
-    pixels, and the standard deviation of the grey values is computed for each block. The contrast
-    is the median of these standard deviations. [own]"""
+    """Contrast is raised below this value, in grey levels (0: never). It is the median, over blocks
+    of 16 x 16 pixels, of the standard deviation of the grey values. [own]"""
 
 
 class StereoConfig(Section):
     """Stereo matching [OS2, III-A]."""
 
     clipped_from: int = Field(250, ge=1, le=255)
-    """A pixel counts as overexposed if its grey level is at least this value. Overexposed pixels
-    are ignored when the gain is measured. Video of limited range (16 to 235) needs about 230.
-    [own]"""
+    """Pixels from this grey level are overexposed, and ignored when the gain is measured. Video of
+    limited range (16 to 235) needs about 230. [own]"""
     black_below: float = Field(6.0, gt=0, le=255)
-    """An image of a stereo pair counts as black if the 95 % quantile of its pixels is below this
-    value, in grey levels, and the other image has contrast. A black image is not used. Video of
-    limited range (16 to 235) needs about 22. [own]"""
+    """An image of a pair is black, and not used, if the 95 % quantile of its grey levels is below
+    this and the other image has contrast. Video of limited range needs about 22. [own]"""
     close_depth_baselines: float = Field(40.0, gt=0)
-    """A stereo point is close if its depth is below this value, in baselines. Close points are
-    mapped from a single stereo pair. Most far points are triangulated from several keyframes. [OS2
-    III-A, printed]"""
+    """Depth below which a stereo point is close, in baselines. Close points are mapped from one
+    pair, most far ones triangulated from several keyframes. [OS2 III-A, printed]"""
     offset_sigma: float = Field(0.2, ge=0)
     """Prior standard deviation of an offset that all disparities have in common, in pixels. The
-    offset is estimated from the motion of the camera (docs/research/motorway.md). A larger value
-    corrects disparities more. With 0, no offset is estimated. [own]"""
+    motion of the camera reveals it (docs/research/motorway.md). With 0, none is estimated. [own]"""
 
 
 class DepthConfig(Section):
     """Depth images [OS2, III-A]."""
 
     min_metres: float = Field(0.1, gt=0)
-    """A measured depth below this value, in metres, counts as unknown. [own]"""
+    """Smaller depths, in metres, count as unknown. [own]"""
     max_metres: float = Field(100.0, gt=0)
-    """A measured depth above this value, in metres, counts as unknown. [own]"""
+    """Larger depths, in metres, count as unknown. [own]"""
     edge_radius: float = Field(4.0, ge=0)
     """A keypoint gets a depth only if the depths within this radius agree, in pixels at octave 0.
     The default is one pixel more than the radius of FAST's circle. [own]"""
     edge_ratio: float = Field(0.07, gt=0)
-    """A keypoint lies on a depth edge if the depths around it differ by more than this fraction of
-    the nearest depth. Such a keypoint gets no depth. [own]"""
+    """Depths around a keypoint agree if they differ by at most this fraction of the nearest.
+    [own]"""
 
 
 class AlignmentConfig(Section):
     """Alignment of matches to sub-pixel accuracy (Forster et al., ICRA 2014, III-B)."""
 
     min_correlation: float = Field(0.85, gt=0, le=1)
-    """A match is aligned only if the normalised cross-correlation of its patch with the image is at
-    least this value. [own]"""
+    """Least normalised cross-correlation of a patch with the image for a match to be aligned.
+    [own]"""
     certainty: int = Field(4, ge=1, le=255)
-    """Ratio of the variance of a keypoint's position to the variance of an aligned match. A larger
-    ratio gives aligned matches more weight. [own]"""
+    """Variance of a keypoint's position, divided by that of an aligned match. A larger ratio gives
+    aligned matches more weight. [own]"""
     keyframes: int = Field(5, ge=1)
-    """Patches are kept for this many of the newest keyframes. Except at a known place, landmarks
-    that only older keyframes observe are not aligned. [own]"""
+    """Number of the newest keyframes that keep patches. Landmarks that only older ones observe are
+    aligned only at a known place. [own]"""
 
 
 class TrackingConfig(Section):
     """Frame-to-map tracking."""
 
     method: Literal["auto", "orb", "patches"] = "auto"
-    """How frames are tracked. `orb` matches ORB features in every frame. `patches` looks for image
-    patches of the landmarks (Forster et al., T-RO 2017), and extracts features only when a keyframe
-    is due or when too few patches are found. `auto` selects `patches` for stereo cameras and `orb`
-    for the other cameras. RGB-D cameras are never tracked by patches. [own]"""
+    """`orb` matches ORB features in every frame. `patches` searches for image patches of the
+    landmarks (Forster et al., T-RO 2017), and extracts features only when a keyframe is due or too
+    few patches are found. `auto` is `patches` for stereo and `orb` otherwise. RGB-D cameras are
+    never tracked by patches. [own]"""
     patch_min_inliers: int = Field(40, ge=10)
-    """Features are extracted for a frame if fewer patches than this agree with its pose. [own]"""
+    """Features are extracted if fewer patches agree with the pose. [own]"""
     patch_min_inlier_ratio: float = Field(0.8, ge=0, le=1)
-    """Features are extracted for a frame if less than this fraction of its patches agree with its
-    pose. This fraction falls below 0.8 among moving vehicles, but not in static scenes. [own]"""
+    """Features are extracted if a smaller fraction of the patches agrees with the pose, as among
+    moving vehicles. [own]"""
     patch_retry_ratio: float = Field(0.86, ge=0, le=1)
-    """If less than this fraction of the patches agree with the pose of a frame, the patches are
-    searched for a second time. The first search begins at a pose that sparse image alignment has
-    refined, and this alignment may have followed moving objects. The second search begins at the
-    predicted pose. The result with more inliers is used. [own]"""
+    """If a smaller fraction of the patches agrees with the pose, they are searched for again from
+    the predicted pose, because sparse image alignment, which precedes the first search, may have
+    followed moving objects. The result with more inliers is used. [own]"""
     motion_window: float = Field(7.0, gt=0)
-    """Search radius when the points of the previous frame are matched, in pixels at octave 0.
-    [OS1 V-B, customary]"""
+    """Search radius for points of the previous frame, in pixels at octave 0. [OS1 V-B,
+    customary]"""
     local_window: float = Field(2.5, gt=0)
-    """Search radius when the local map is matched, in pixels at octave 0. [OS1 V-D, customary]"""
+    """Search radius for landmarks of the local map, in pixels at octave 0. [OS1 V-D, customary]"""
     sudden_min_inlier_ratio: float = Field(0.4, ge=0, le=1)
-    """At least this fraction of the matches in `sudden_window` must be inliers, so that the camera
-    is not tracked against a moving object. [own]"""
+    """After a sudden motion, at least this fraction of the matches must be inliers, so that the
+    camera is not tracked against a moving object. [own]"""
     local_keyframes: int = Field(80, ge=1)
-    """Upper bound of the number of keyframes in the local map. The keyframes that share the most
-    landmarks with the reference keyframe are chosen. [OS1 V-D, customary]"""
+    """Upper bound of the keyframes in the local map: those that share the most landmarks with the
+    reference keyframe. [OS1 V-D, customary]"""
     min_stereo_start: int = Field(100, ge=10)
-    """Number of stereo features that a frame needs to start a map. [OS2 III-B, own]"""
+    """Stereo features that a frame needs to start a map. [OS2 III-B, own]"""
     min_inlier_ratio: float = Field(0.3, ge=0, le=1)
-    """A frame is also tracked from the reference keyframe if less than this fraction of the matches
-    with the previous frame are inliers. [own]"""
+    """If a smaller fraction of the matches with the previous frame are inliers, the frame is also
+    tracked from the reference keyframe. [own]"""
     min_inliers: int = Field(30, ge=3)
-    """A frame with fewer inliers than this in the local map is WEAK. Its pose is used, but it is
-    reported as uncertain. [OS1 V-D, customary]"""
+    """A frame with fewer inliers in the local map is WEAK: its pose is used, but reported as
+    uncertain. [OS1 V-D, customary]"""
     lost_frames_before_restart: int = Field(3, ge=1)
-    """A stereo or RGB-D camera starts a sub-map at the predicted pose after this many lost frames.
+    """Lost frames after which a stereo or RGB-D camera starts a sub-map at the predicted pose.
     [own]"""
     young_keyframes: int = Field(5, ge=0)
-    """A map with at most this many keyframes is young. In a young map, a stereo or RGB-D camera
-    starts a sub-map after a single lost frame. [own]"""
+    """With at most this many keyframes in the map, a stereo or RGB-D camera starts a sub-map after
+    one lost frame. [own]"""
     monocular_lost_frames: int = Field(4, ge=1)
-    """A monocular camera starts a sub-map from two new views after this many lost frames. [own]"""
+    """Lost frames after which a monocular camera starts a sub-map from two new views. [own]"""
 
 
 class InitializationConfig(Section):
     """The first two keyframes of a monocular map [OS1, IV]."""
 
     min_features: int = Field(200, ge=20)
-    """A frame can become the first view if it has at least this many features. [own]"""
+    """Features that a frame needs to be the first view. [own]"""
     min_matches: int = Field(100, ge=8)
-    """If the two views have fewer matches than this, the second view replaces the first.
-    [OS1 IV, customary]"""
+    """With fewer matches, the second view replaces the first. [OS1 IV, customary]"""
     min_parallax_deg: float = Field(1.0, gt=0)
-    """At least `min_points` points must have this parallax, in degrees. With a larger value, the
-    map starts only after a longer motion of the camera. [OS1 IV, customary]"""
+    """Parallax that 50 points must have, in degrees. A larger value needs a longer motion. [OS1 IV,
+    customary]"""
     min_landmarks: int = Field(100, ge=8)
-    """At least this many landmarks must remain after the first bundle adjustment.
-    [OS1 IV, customary]"""
+    """Landmarks that must remain after the first bundle adjustment. [OS1 IV, customary]"""
     median_depth: float = Field(15.0, gt=0)
-    """The first landmarks are scaled to this median depth, in map units. [own]"""
+    """Median depth to which the first landmarks are scaled, in map units. [own]"""
     max_seconds: float = Field(1.5, gt=0)
-    """Longest time between the two views, in seconds. After this time, the next frame replaces the
-    first view. [own]"""
+    """Longest time between the two views, in seconds. After it, the next frame replaces the first
+    view. [own]"""
 
 
 class KeyframeConfig(Section):
     """Keyframe decision [OS2, III-E]."""
 
     max_interval_s: float = Field(1.0, gt=0)
-    """A keyframe is inserted if the last keyframe is at least this old, in seconds. [OS1 V-E,
+    """A keyframe is inserted if the last one is at least this old, in seconds. [OS1 V-E,
     customary]"""
     depth_max_interval_s: float = Field(0.3, gt=0)
-    """Replaces `max_interval_s` for an RGB-D camera, in seconds. It is shorter, because such a
-    camera is usually hand-held. [own]"""
+    """Replaces `max_interval_s` for RGB-D cameras, which are usually hand-held, in seconds.
+    [own]"""
     min_tracked_close: int = Field(100, ge=0)
-    """A keyframe is inserted if the frame tracks fewer close points than this, and could add more
-    than `min_new_close` new close points. [OS2 III-E, printed]"""
+    """A keyframe is inserted if the frame tracks fewer close points, and could add more than
+    `min_new_close`. [OS2 III-E, printed]"""
     min_new_close: int = Field(70, ge=0)
-    """If a frame tracks too few close points, it becomes a keyframe only if it could add more new
-    close points than this. [OS2 III-E, printed]"""
+    """Such a frame must be able to add more new close points than this. [OS2 III-E, printed]"""
     patch_kept_close: float = Field(0.4, ge=0, le=1)
-    """A frame that was tracked by patches becomes a keyframe if it tracks less than this fraction
-    of the close points that the first frame after the last keyframe tracked. [own]"""
+    """A frame tracked by patches becomes a keyframe if it tracks less than this fraction of the
+    close points that the first frame after the last keyframe tracked. [own]"""
     max_tracked_ratio: float = Field(0.75, gt=0, le=1)
     """A keyframe is inserted if the frame tracks less than this fraction of the landmarks of the
-    reference keyframe. A larger fraction inserts keyframes more often. [OS1 V-E, customary]"""
+    reference keyframe. A larger fraction inserts more. [OS1 V-E, customary]"""
     monocular_ratio: float = Field(0.9, gt=0, le=1)
     """Replaces `max_tracked_ratio` for a monocular camera. [OS1 V-E, printed]"""
     known_after_s: float = Field(30.0, gt=0)
-    """A keyframe is old after this time, in seconds. If the camera returns to a known place, an old
-    keyframe becomes the reference again, and no new keyframe is inserted. [own]"""
+    """Age from which a keyframe is old, in seconds. At a known place, an old keyframe becomes the
+    reference, and none is inserted. [own]"""
     known_ratio: float = Field(0.5, gt=0)
     """A place is known if the frame tracks at least this fraction of the landmarks of an old
-    keyframe. With a larger fraction, more new keyframes are inserted at old places. [own]"""
+    keyframe. A larger fraction inserts more keyframes at old places. [own]"""
     known_min_inliers: int = Field(50, ge=0)
-    """A place is known only if the frame tracks at least this many landmarks. [own]"""
+    """Landmarks that a frame must track at a known place. [own]"""
     publish_after_frames: int = Field(2, ge=1)
-    """Tracking uses the result of local mapping this many frames after the keyframe. If the next
-    keyframe comes earlier, tracking uses the result there. With a smaller value, tracking waits for
-    mapping more often. [own]"""
+    """Tracking uses the result of mapping this many frames after the keyframe, or at the next
+    keyframe. With a smaller value, it waits for mapping more often. [own]"""
 
 
 class MappingConfig(Section):
     """Local mapping and bundle adjustment."""
 
     neighbours: int = Field(10, ge=1)
-    """New landmarks are triangulated between a new keyframe and this many covisible keyframes.
-    [OS1 VI-C, customary]"""
+    """Covisible keyframes with which a new keyframe triangulates landmarks. [OS1 VI-C,
+    customary]"""
     epipolar_distance: int = Field(50, ge=0, le=256)
-    """Upper bound of the descriptor distance when features are matched for triangulation, in bits.
-    [OS1 VI-C, customary]"""
+    """Upper bound of the descriptor distance for triangulation, in bits. [OS1 VI-C, customary]"""
     fuse_distance: int = Field(50, ge=0, le=256)
-    """Upper bound of the descriptor distance between duplicate landmarks, in bits.
-    [OS1 VI-C, customary]"""
+    """Upper bound of the descriptor distance between duplicate landmarks, in bits. [OS1 VI-C,
+    customary]"""
     min_stereo_points: int = Field(100, ge=0)
-    """If a keyframe has fewer close stereo features than this, its nearest stereo features are
-    mapped, up to this number. [OS2 III-E, printed]"""
+    """A keyframe with fewer close stereo features maps its nearest ones, up to this number. [OS2
+    III-E, printed]"""
     redundant_ratio: float = Field(0.9, gt=0, le=1)
-    """A keyframe is culled if more than this fraction of its landmarks are redundant. A landmark is
-    redundant if at least three other keyframes observe it. With a larger fraction, more keyframes
-    are kept. [OS1 VI-E, printed]"""
+    """A keyframe is culled if more than this fraction of its landmarks are observed by at least
+    three other keyframes each. A larger fraction keeps more keyframes. [OS1 VI-E, printed]"""
     max_ba_keyframes: int = Field(60, ge=2)
-    """Upper bound of the number of keyframes that local bundle adjustment optimises.
-    [OS1 VI-D, own]"""
+    """Upper bound of the keyframes that local bundle adjustment optimises. [OS1 VI-D, own]"""
     ba_iterations: int = Field(10, ge=1)
-    """Upper bound of the number of iterations of local bundle adjustment. The first pass, before
-    outliers are removed, has half as many. [OS1 VI-D, customary]"""
+    """Upper bound of the iterations of local bundle adjustment. The first pass, before outliers are
+    removed, has half as many. [OS1 VI-D, customary]"""
 
 
 class VerificationConfig(Section):
     """Geometric verification of loop candidates [OS1, VII-B; OS2, III-C]."""
 
     descriptors: Literal["auto", "orb", "learned", "both"] = "auto"
-    """The descriptors with which loop candidates are verified. `orb` uses ORB descriptors, and
-    `learned` uses the local descriptors of the network. `both` uses the learned descriptors where
-    ORB fails. `auto` selects `orb` for the detectors `bow` and `capsule-paper` and for plug-ins,
-    and `both` for all other detectors. [own]"""
+    """What verifies loop candidates: `orb`, `learned` (local descriptors of the network), or `both`
+    (learned ones where ORB fails). `auto` is `orb` for `bow`, `capsule-paper` and plug-ins, and
+    `both` for all other detectors. [own]"""
     min_inliers: int = Field(40, ge=6)
-    """At least this many inliers must remain after guided search. [OS1 VII-B, customary]"""
+    """Inliers that must remain after guided search. [OS1 VII-B, customary]"""
     max_distance: float = Field(15.0, gt=0)
     """Upper bound of the distance between the cameras of query and match, in metres. [own]"""
 
@@ -273,137 +257,126 @@ class LearnedMatchingConfig(Section):
     """Verification of loop candidates using learned local descriptors, where ORB fails."""
 
     max_candidates: int = Field(2, ge=1)
-    """Upper bound of the number of candidates that are tried for a keyframe or a lost frame.
-    [own]"""
+    """Upper bound of the candidates that are tried for a keyframe or a lost frame. [own]"""
     max_compared: int = Field(5, ge=0)
-    """If the detector has not compared its candidates using local descriptors, this many of the
-    best candidates are compared before verification. [own]"""
+    """If the detector has not compared its candidates by local descriptors, this many of the best
+    are compared before verification. [own]"""
     most_shared: float = Field(0.4, gt=0, le=1)
     """The image of a keyframe is not kept for the network if the keyframe shares at least this
-    fraction of its landmarks with another keyframe whose image is kept. [own]"""
+    fraction of its landmarks with one whose image is kept. [own]"""
     min_similarity: float = Field(0.35, ge=0, le=1)
-    """Two images are matched only if their similarity according to local descriptors is at least
-    this value. [own]"""
+    """Least similarity by local descriptors for two images to be matched. [own]"""
     retry_interval: int = Field(8, ge=0)
-    """After a failed attempt, `retry_factor` applies to this many keyframes. [own]"""
+    """Keyframes after a failed attempt during which `retry_factor` applies. [own]"""
     retry_factor: float = Field(1.1, ge=1)
-    """During the `retry_interval` keyframes after a failed attempt, a place is tried only if its
-    similarity is at least this many times the similarity in the failed attempt. [own]"""
+    """A place is then tried only if its similarity is at least this many times that of the failed
+    attempt. [own]"""
     min_inliers: int = Field(80, ge=6)
-    """At least this many inliers must remain after guided search. [own]"""
+    """Inliers that must remain after guided search. [own]"""
     verified_memory: int = Field(10, ge=1)
-    """With learned verification, `consistency.verified_memory` is raised to this number if it is
-    smaller, because only some keyframes have an image with which a loop can be verified. [own]"""
+    """Replaces a smaller `consistency.verified_memory` in learned verification, because only some
+    keyframes have an image. [own]"""
 
 
 class ConsistencyConfig(Section):
     """Test whether several keyframes agree on a loop [OS1, VII-A]."""
 
     min_keyframes: int = Field(2, ge=1)
-    """At least this many consecutive keyframes must resemble the place. OS1 requires 3.
-    [OS1 VII-A, own]"""
+    """Consecutive keyframes that must resemble the place. OS1 requires 3. [OS1 VII-A, own]"""
     max_gap: int = Field(1, ge=0)
-    """Between two keyframes that resemble the place, up to this many keyframes need not resemble
-    it. OS1 allows none. [OS1 VII-A, own]"""
+    """Keyframes between two of them that need not resemble it. OS1 allows none. [OS1 VII-A, own]"""
     max_wrong: float = Field(3e-3, gt=0, le=0.5)
-    """A loop is closed only if the probability that it is wrong is at most this value, according to
-    its own evidence and that of a loop that agrees with it. [own]"""
+    """A loop is closed only if the probability that it is wrong is at most this, by its own
+    evidence and that of a loop that agrees with it. [own]"""
     max_wrong_at_end: float = Field(1e-2, gt=0, le=0.5)
-    """At the end of a drive, when no further evidence can come, a loop that waits is closed if this
-    probability is at most this value. [own]"""
+    """Replaces `max_wrong` at the end of a drive, when no further evidence can come. [own]"""
     verified_memory: int = Field(5, ge=1)
-    """A verified loop is remembered for this many keyframes. [own]"""
+    """Keyframes for which a verified loop is remembered. [own]"""
     min_moved: float = Field(0.15, ge=0)
     """At the end of a drive, an earlier keyframe may confirm a loop only if its distance from the
-    query is at least this fraction of the median depth of the matched landmarks. A nearer keyframe
-    would only repeat the evidence of the query. [own]"""
+    query is at least this fraction of the median depth of the matched landmarks. A nearer one would
+    repeat the evidence of the query. [own]"""
 
 
 class RelocalizationConfig(Section):
     """Relocalisation of a lost camera [OS1, V-C]."""
 
     min_inliers: int = Field(50, ge=6)
-    """A frame is relocalised if it has at least this many inliers. [OS1 V-C, customary]"""
+    """Inliers that a frame needs to be relocalised. [OS1 V-C, customary]"""
     min_elsewhere: int = Field(15, ge=0)
-    """At least this many inliers must lie outside a vertical strip that is a third of the image
-    wide. The strip is placed where it contains as many inliers as possible. [own]"""
+    """Inliers that must lie outside the vertical strip, a third of the image wide, that contains
+    the most. [own]"""
     max_candidates: int = Field(5, ge=1)
-    """Upper bound of the number of places that are tried for a lost frame. [own]"""
+    """Upper bound of the places that are tried for a lost frame. [own]"""
     doubtful_gap: float = Field(1.5, gt=1)
-    """A frame counts as coming after a gap if the time since the last tracked frame exceeds the
-    usual interval between frames by more than this factor. [own]"""
+    """A frame comes after a gap if the time since the last tracked frame exceeds the usual interval
+    by more than this factor. [own]"""
     doubtful_share: float = Field(0.5, ge=0, le=1)
-    """A frame is doubtful if it tracks less than this fraction of the landmarks of the reference
-    keyframe, and if there is a second reason for doubt. The second reason is that the frame comes
-    after a gap, that its pose could not be predicted, or that it tracks less than this fraction of
-    the number of landmarks in the previous frame. For a doubtful frame, vslam searches the whole
-    map. [own]"""
+    """A frame is doubtful, and the whole map is searched, if it tracks less than this fraction of
+    the landmarks of the reference keyframe, and also comes after a gap, was not predicted, or
+    tracks less than this fraction of the number of landmarks in the previous frame. [own]"""
     better: float = Field(1.5, ge=1)
-    """For a doubtful frame, the pose that the search of the whole map finds is used only if it has
-    more than this many times as many inliers as the tracked pose. [own]"""
+    """The pose of this search is used only if it has more than this many times as many inliers as
+    the tracked pose. [own]"""
 
 
 class LoopConfig(Section):
     """Closing a verified loop, and global bundle adjustment afterwards [OS1, VII]."""
 
     overwhelming: float = Field(1e-6, ge=0)
-    """A loop that contradicts the odometry is closed nevertheless, and odometry is taken to be
-    wrong, if the probability that the loop is wrong is at most this value. [own]"""
+    """A loop that contradicts the odometry is closed nevertheless if the probability that the loop
+    is wrong is at most this. [own]"""
 
     global_iterations: int = Field(10, ge=1)
-    """Upper bound of the number of iterations of global bundle adjustment.
-    [OS2 III-D, customary]"""
+    """Upper bound of the iterations of global bundle adjustment. [OS2 III-D, customary]"""
     min_revisits: int = Field(5, ge=1)
-    """The map is adjusted again when the camera leaves old places and at the end of the drive, if
-    at least this many frames have measured old places since the last adjustment. These frames are
-    new keyframes that observe an old place, and frames whose reference is an old keyframe. [own]"""
+    """When the camera leaves old places, and at the end, the map is adjusted again if at least this
+    many frames have measured them since the last adjustment: new keyframes that observe an old
+    place, and frames whose reference is an old keyframe. [own]"""
     revisits_share: float = Field(0.1, ge=0)
-    """While the camera stays at old places, the map is adjusted again when the number of these
-    frames reaches this fraction of the number of keyframes. [own]"""
+    """At old places, the map is adjusted again when these frames reach this fraction of the number
+    of keyframes. [own]"""
 
 
 class BowConfig(Section):
     """Loop candidates from a bag of words [OS1, III-E and VII-A]."""
 
     exclude_recent: int = Field(20, ge=1)
-    """This many of the newest keyframes, including the query, are never candidates. [own]"""
+    """Number of the newest keyframes, including the query, that are never candidates. [own]"""
     group_size: int = Field(10, ge=0)
-    """A candidate forms a group with at most this many of its most covisible keyframes.
-    [OS1 III-E, customary]"""
+    """Upper bound of the most covisible keyframes with which a candidate forms a group. [OS1 III-E,
+    customary]"""
     max_groups: int = Field(30, ge=1)
-    """Upper bound of the number of groups. Groups are formed around the candidates with the highest
-    scores. [own]"""
+    """Upper bound of the groups, which are formed around the candidates with the highest scores.
+    [own]"""
 
 
 class PoseGraphConfig(Section):
     """The pose graph of a loop closure: weights of the edges, and when a loop is rejected.
 
-    An edge has less weight if its standard deviation is larger. Drift is modelled as a random walk:
-    its standard deviation grows with the square root of the distance travelled. With the default
-    values, the drift is 1.2 % after 400 m, and nearly all of it is caused by errors of rotation.
+    An edge with a larger standard deviation has less weight. Drift is modelled as a random walk,
+    whose standard deviation grows with the square root of the distance travelled: 1.2 % after 400 m
+    with the defaults, nearly all of it from errors of rotation.
 
-    An edge is a gap if tracking was lost between its two keyframes. The motion along a gap is only
-    predicted. A gap gets a small weight if no prediction was possible. It also gets a small weight
-    under the hypothesis that the camera was carried to another place while tracking was lost.
+    An edge across a loss of tracking is a gap: the motion is only predicted. It gets a small weight
+    if nothing could be predicted, and under the hypothesis that the camera was carried elsewhere.
     """
 
     min_shared: int = Field(100, ge=1)
-    """A covisibility edge belongs to the graph if its two keyframes share at least this many
-    landmarks. [OS1 III-D, printed]"""
+    """Landmarks that two keyframes must share to have a covisibility edge in the graph. [OS1 III-D,
+    printed]"""
     translation_drift: float = Field(0.03, gt=0)
-    """Standard deviation of the translational drift of odometry, in metres per square root of a
-    metre. [own]"""
+    """Standard deviation of translational drift, in metres per square root of a metre. [own]"""
     rotation_drift: float = Field(0.001, gt=0)
-    """Standard deviation of the rotational drift of odometry, in radians per square root of a
-    metre. [own]"""
+    """Standard deviation of rotational drift, in radians per square root of a metre. [own]"""
     loop_inflation: float = Field(1.5, gt=0)
-    """Factor that multiplies the computed covariance of a verified loop, which does not contain the
-    errors of the landmarks (docs/research/uncertainty.md). [own]"""
+    """Factor on the covariance of a verified loop, which lacks the errors of the landmarks
+    (docs/research/uncertainty.md). [own]"""
     robust_scale: float = Field(3.0, gt=0)
-    """Scale of the Cauchy loss on loops, in standard deviations. A smaller scale reduces the
+    """Scale of the Cauchy loss on loops, in standard deviations. A smaller one reduces the
     influence of loops that contradict the other edges. [own]"""
     max_loop_error: float = Field(30.0, gt=0)
-    """A loop is rejected if its chi-square after optimisation is above this value. [own]"""
+    """A loop with a greater chi-square after optimisation is rejected. [own]"""
     max_strain: float = Field(60.0, gt=0)
     """A loop is rejected if the chi-square of all other edges exceeds this number times the number
     of closed loops. [own]"""
@@ -413,39 +386,36 @@ class SiameseConfig(Section):
     """Loop candidates from a Siamese network [ZS]."""
 
     threshold: float = Field(0.9, ge=0, le=1)
-    """A keyframe is a loop candidate if its similarity is at least this value. [ZS, printed]"""
+    """Similarity from which a keyframe is a loop candidate. [ZS, printed]"""
     offered: float = Field(0.1, ge=0, le=1)
     """Replaces `threshold` if learned descriptors verify the candidates. A smaller value proposes
-    more candidates. [own]"""
+    more. [own]"""
     max_candidates: int = Field(5, ge=1)
-    """Upper bound of the number of candidates for a query. The best candidates are kept. [own]"""
+    """Upper bound of the candidates of a query. The best are kept. [own]"""
     recent_keyframes: int = Field(10, ge=0)
-    """This many of the newest keyframes are never candidates. [own]"""
+    """Number of the newest keyframes that are never candidates. [own]"""
     reach: float = Field(20.0, ge=0)
-    """If learned descriptors verify the candidates, the query is compared only with keyframes
-    within this distance, in metres. `reach_share` increases this distance. [own]"""
+    """If learned descriptors verify, a query is compared only with keyframes within this distance,
+    in metres, increased by `reach_share`. [own]"""
     reach_share: float = Field(0.05, ge=0)
-    """This fraction of the distance travelled since the keyframe is added to `reach`. The default
-    is several times the drift of a stereo camera in a street, which is about one per cent. [own]"""
+    """Fraction of the distance travelled since the keyframe. The default is several times the drift
+    of a stereo camera in a street, about 1 %. [own]"""
     monocular_reach_share: float = Field(0.3, ge=0)
-    """Replaces `reach` and `reach_share` in monocular maps, whose scale is unknown and drifts. The
-    query is compared only with keyframes that are nearer than this fraction of the distance
-    travelled since the keyframe. The default is twice the value that KITTI 00 needs, where the
-    scale drifts by a factor of 2.3. [own]"""
+    """Replaces both in monocular maps, whose scale drifts: the query is compared only with
+    keyframes nearer than this fraction of the distance travelled since. The default is twice what
+    KITTI 00 needs, where the scale drifts by a factor of 2.3. [own]"""
     reach_angle: float = Field(60.0, gt=0, le=180)
-    """The query is compared only with keyframes whose viewing direction differs from that of the
-    query by at most this value, in degrees. The detectors do not recognise a place that is seen
-    from behind or from the side. [own]"""
+    """The query is compared only with keyframes whose viewing direction differs by at most this, in
+    degrees. The detectors do not recognise a place from behind or from the side. [own]"""
     reach_speedup: float = Field(5.0, ge=0)
-    """While the camera is lost, its speed is assumed to be at most this many times the mean speed
-    of the drive. If learned descriptors relocalise it, keyframes that it cannot have reached are
-    not tried. [own]"""
+    """A lost camera is assumed to be at most this many times as fast as the mean of the drive.
+    Learned descriptors do not try keyframes that it cannot have reached. [own]"""
     embedded_at_once: int = Field(8, ge=1)
-    """Upper bound of the number of keyframes that the network processes for one query. The nearest
-    keyframes are chosen. [own]"""
+    """Upper bound of the keyframes that the network processes for a query, the nearest first.
+    [own]"""
     fit: Literal["squash", "crop"] = "squash"
-    """How an image is fitted to the network's input size. `squash` scales the whole image. `crop`
-    cuts out its middle. [own]"""
+    """How an image is fitted to the network's input: `squash` scales all of it, `crop` cuts out its
+    middle. [own]"""
 
 
 class Config(Section):

@@ -213,7 +213,7 @@ def test_the_card_tells_where_the_weights_come_from(tmp_path):
     assert written["validation"]["average_precision"] == outcome.figures["average_precision"]
     assert written["commit"]
     assert written["settings"]["seed"] == 0
-    assert "--data pairs:x" in paths[1].read_text()
+    assert "blobs (40)" in paths[1].read_text()
 
 
 @pytest.mark.slow

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from vslam.config import AlignmentConfig
 from vslam.frontend.patches import patches_around
-from vslam.frontend.track import Track
 from vslam.support.kernels import inner_kernel, kernel
 from vslam.types.features import PATCH_RADIUS, PATCH_SIDE, LandmarkPatches, Pyramid
+from vslam.types.track import Track
 
 # Upper bound of the number of Gauss-Newton iterations. [own]
 _ITERATIONS = 7

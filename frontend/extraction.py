@@ -13,14 +13,14 @@ from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.masks import Mask
 from vslam.frontend.orb import Extraction, build_pyramid, extract_at
 from vslam.frontend.pose_alignment import coarse_levels
-from vslam.frontend.sides import Sides, balanced, compare_sides
+from vslam.frontend.sides import balanced, compare_sides
 from vslam.frontend.stereo import StereoMatches, inliers_only, match_stereo
 from vslam.frontend.weak_images import extract_in_any_light
 from vslam.support.errors import UnreadableImageError
 from vslam.support.workers import Job, Urgency, Workers
 from vslam.types.camera import DepthImage, Image, ImageMap, check_images, check_mask
 from vslam.types.context import Context
-from vslam.types.features import Extracted, Features, Keypoints, Pyramid
+from vslam.types.features import Extracted, Features, Keypoints, Pyramid, Sides
 
 
 class Corners(NamedTuple):
@@ -53,7 +53,6 @@ class FrameImages:
         mask: the mask of the left image; None if all pixels are used.
         pyramid: the pyramid of the left image; None if frames are not tracked by patches.
         coarse: ``coarse_levels`` of ``pyramid``; None if ``pyramid`` is None.
-        sides, problem: see ``Corners``; None before ``corners`` is accessed.
     """
 
     def __init__(
@@ -72,8 +71,6 @@ class FrameImages:
         self.mask = mask
         self.pyramid: Pyramid | None = None
         self.coarse: Pyramid | None = None
-        self.sides: Sides | None = None
-        self.problem: str | None = None
         self._read_second = read_second
         self._context = context
         self._image_map = image_map
@@ -94,9 +91,7 @@ class FrameImages:
         """The features that a corner detector finds, and their stereo matches. The first access
         reads the second image (right image or depth image)."""
         started = self._started
-        corners = self._find_corners(self._image_map) if started is None else started.result()
-        self.sides, self.problem = corners.sides, corners.problem
-        return corners
+        return self._find_corners(self._image_map) if started is None else started.result()
 
     @cached_property
     def extracted(self) -> Extracted:
@@ -190,16 +185,16 @@ def matched(corners: Corners, context: Context, keypoints: Keypoints | None = No
             adds no features.
     """
     camera, config = context.camera, context.config
-    found, matches, depth, sides, _ = corners
+    found, matches, depth, sides, problem = corners
     if sides is not None and sides.black == "left":
-        return Extracted.nothing()
+        return Extracted(Features.none(), sides=sides)
     # Without a pyramid, matches are not aligned. Depth cameras have a rolling shutter, which moves
     # points by more than alignment corrects.
     pyramid = None if camera.depth else found.pyramid
     if depth is not None:
         scale = context.scales[found.octave]
         u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
-        return Extracted(_features(found, u_right), pyramid)
+        return Extracted(_features(found, u_right), pyramid, problem=problem)
     if keypoints is not None:
         more = extract_at(found, *keypoints)
         found, order = found.joined(more)
@@ -208,8 +203,9 @@ def matched(corners: Corners, context: Context, keypoints: Keypoints | None = No
             matches = matches.joined(added, order)
     if matches is None:
         u_right = np.full(len(found.xy), np.nan, np.float32)
-        return Extracted(_features(found, u_right), pyramid)
-    return Extracted(_features(found, inliers_only(matches, found.octave)), pyramid)
+        return Extracted(_features(found, u_right), pyramid, problem=problem)
+    u_right = inliers_only(matches, found.octave)
+    return Extracted(_features(found, u_right), pyramid, sides=sides, problem=problem)
 
 
 def _features(found: Extraction, u_right: NDArray[np.float32]) -> Features:

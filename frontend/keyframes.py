@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vslam.config import KeyframeConfig
-from vslam.frontend.track import Track
 from vslam.frontend.tracking import feature_depth
 from vslam.types.context import Context
 from vslam.types.geometry import transform
 from vslam.types.map_view import MapView
 from vslam.types.states import PolicyState
+from vslam.types.track import Track
 
 # If keyframes add on average fewer close points than `min_tracked_close`, this fraction of the
 # average replaces `min_tracked_close` (docs/research/motorway.md). [own]

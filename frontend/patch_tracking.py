@@ -23,7 +23,7 @@ from vslam.types.context import Context
 from vslam.types.features import PATCH_RADIUS, Features, Pyramid
 from vslam.types.geometry import Matrix, orthonormalised, transform
 from vslam.types.map_view import MapView
-from vslam.types.states import Standstill
+from vslam.types.track import Standstill
 
 _MARGIN = PATCH_RADIUS + 2  # least distance of a patch centre from the border of its level, pixels
 

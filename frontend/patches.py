@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import AlignmentConfig
-from vslam.frontend.track import Track
 from vslam.support.kernels import kernel
 from vslam.types.features import (
     PATCH_PIXELS,
@@ -27,6 +26,7 @@ from vslam.types.features import (
 )
 from vslam.types.geometry import Matrix
 from vslam.types.map import Map
+from vslam.types.track import Track
 
 
 def patches_around(

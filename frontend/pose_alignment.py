@@ -53,6 +53,24 @@ def coarse_levels(pyramid: Pyramid) -> Pyramid:
     return coarse_pyramid(pixels, shapes, (int(height), int(width)))
 
 
+def is_coarse(pyramid: Pyramid, shapes: NDArray[np.int64], size: tuple[int, int]) -> bool:
+    """Return whether a pyramid that was read from a file can be a result of ``coarse_levels``.
+
+    Args:
+        shapes: ``(L, 2)`` heights and widths of the levels of the whole pyramid.
+        size: height and width of the whole image, pixels.
+    """
+    expected = coarse_shapes(shapes)
+    if len(pyramid.pixels) != expected.prod(axis=1).sum():
+        return False
+    made = coarse_pyramid(pyramid.pixels, expected, size)
+    return (
+        np.array_equal(pyramid.offsets, made.offsets)
+        and np.array_equal(pyramid.shapes, made.shapes)
+        and np.array_equal(pyramid.scales, made.scales)
+    )
+
+
 def coarse_shapes(shapes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the ``(3, 2)`` heights and widths of the images that ``coarse_levels`` returns.
 
@@ -66,19 +84,13 @@ def coarse_shapes(shapes: NDArray[np.int64]) -> NDArray[np.int64]:
 def coarse_pyramid(
     pixels: NDArray[np.uint8], shapes: NDArray[np.int64], size: tuple[int, int]
 ) -> Pyramid:
-    """Rebuild the result of ``coarse_levels`` from its pixels.
+    """Return the small images with the given pixels.
 
     Args:
         shapes: the result of ``coarse_shapes``.
         size: height and width of the whole image, pixels.
-
-    Raises:
-        ValueError: the number of pixels does not match the shapes.
     """
-    counts = shapes.prod(axis=1)
-    if len(pixels) != counts.sum():
-        raise ValueError(f"{len(pixels)} pixels instead of {counts.sum()}")
-    offsets = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
+    offsets = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))[:-1]]).astype(np.int64)
     return Pyramid(pixels, offsets, shapes, size[1] / shapes[:, 1])
 
 

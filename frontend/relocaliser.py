@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from vslam.frontend.images import Images
 from vslam.frontend.masks import Mask
 from vslam.frontend.matching import count_elsewhere
-from vslam.frontend.track import By, Images, Track
 from vslam.frontend.tracking import (
     judge,
     match_descriptors,
@@ -27,6 +27,7 @@ from vslam.types.features import Features, TrackingState
 from vslam.types.loops import LastSeen, Localisation, LoopCandidate
 from vslam.types.map import Map
 from vslam.types.map_view import LocalMap, local_map
+from vslam.types.track import By, Track
 
 # Upper bound of the descriptor distance of a match, in bits. [OS1 V-C, customary]
 _MATCH_DISTANCE = 50

@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from vslam.frontend.sides import with_pair
-from vslam.frontend.track import Images, Track
 from vslam.types.camera import Camera
 from vslam.types.features import Extracted, shifted_columns
 from vslam.types.geometry import Matrix
 from vslam.types.image_motion import columns_without_delay
 from vslam.types.states import ComparedSides
+from vslam.types.track import Track
 
 
 def corrected(
@@ -61,11 +61,12 @@ class RigMonitor:
         self.sides = ComparedSides() if sides is None else sides
         self.problems: list[str] = []
 
-    def observe(self, track: Track, images: Images) -> None:
-        """Record what a frame and its images tell about the rig."""
-        if images.sides is not None:
-            self.sides = with_pair(self.sides, images.sides)
-        if images.problem is not None:
+    def observe(self, track: Track) -> None:
+        """Record what a frame tells about the rig, if its features were extracted."""
+        sides, problem = track.extracted.sides, track.extracted.problem
+        if sides is not None:
+            self.sides = with_pair(self.sides, sides)
+        if problem is not None:
             self.problems.append(
-                f"Frame {track.index} has only its left image: {images.problem.rstrip('.')}."
+                f"Frame {track.index} has only its left image: {problem.rstrip('.')}."
             )

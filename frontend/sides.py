@@ -8,14 +8,13 @@ can therefore be estimated from the quantiles of all grey values.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import log2
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.config import StereoConfig
+from vslam.types.features import Sides
 from vslam.types.states import ComparedSides
 
 # The darker image of a stereo pair is brightened before stereo matching if the gain between the
@@ -38,21 +37,6 @@ _N_QUANTILES = 11  # number of quantiles that are compared between the two image
 # one image shows the sky, the difference is at least 0.22.
 _MAX_DEVIATION = 0.12
 _MIN_VISIBLE_RANGE = 16.0  # least range of the grey values of an image that is not black
-
-
-@dataclass(frozen=True)
-class Sides:
-    """The difference in exposure between the left and the right image of a stereo pair.
-
-    Attributes:
-        darker_stops: difference in exposure, in stops; positive if the right image is darker. It is
-            0 if the difference is below the threshold, or if a common gain does not explain the
-            difference.
-        black: the side whose image is black while the other image is not; empty if there is none.
-    """
-
-    darker_stops: float = 0.0
-    black: Literal["", "left", "right"] = ""
 
 
 def with_pair(compared: ComparedSides, sides: Sides) -> ComparedSides:

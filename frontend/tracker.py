@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.frontend.images import Images
 from vslam.frontend.patch_tracking import (
     NO_PATCHES_FOUND,
     PatchTrack,
@@ -15,23 +16,21 @@ from vslam.frontend.patch_tracking import (
 )
 from vslam.frontend.pose import MIN_TRUSTED
 from vslam.frontend.pose_alignment import align_pose
+from vslam.frontend.prediction import Prediction
 from vslam.frontend.rig import corrected
-from vslam.frontend.track import By, Images, Prediction, Track
 from vslam.frontend.tracking import (
+    MIN_INLIERS_FRAME,
     MIN_INLIERS_LOST,
-    MIN_INLIERS_MOTION,
     judge,
-    track_descriptors,
     track_local_map,
-    track_motion,
-    track_sudden_motion,
+    track_previous_frame,
 )
 from vslam.support.machine import StageClock
 from vslam.types.context import Context
 from vslam.types.features import Extracted, TrackingState, nearest_features
 from vslam.types.geometry import Matrix, inverse, transform
 from vslam.types.map_view import MapView
-from vslam.types.states import Standstill
+from vslam.types.track import By, Standstill, Track
 
 # If the features of a frame do not match either, its pose is nevertheless found by patches if at
 # least this fraction of the patches agree with it. The frame is then WEAK. [own]
@@ -40,13 +39,6 @@ _PATCH_FALLBACK_RATIO = 0.5
 # to the nearest feature. The distance is at most this value, in pixels of the feature's octave.
 # [own]
 _PATCH_FEATURE_REACH = 2.0
-# Replaces `local_window` for a frame that could be matched with neither the previous frame nor
-# the reference keyframe, in pixels at octave 0. [own]
-_PREDICTED_WINDOW = 7.0
-# A frame is matched with the local map only if tracking from the previous frame, from the
-# reference keyframe, with `predicted_window` or with `sudden_window` gives at least this many
-# inliers. Otherwise, the frame is LOST. [OS1 V-B, customary]
-_MIN_INLIERS_FRAME = 10
 
 # The prediction of the motion is wrong by at most this acceleration, m/s^2, in ordinary drives. A
 # pose that implies a larger one needs IMPLAUSIBLE^-1 times as many landmarks that agree with it.
@@ -226,8 +218,8 @@ class Tracker:
         """
         still = predicted.standstill(view)
         view, context = _trusting(view, still), self._context
-        first = self._track_previous_frame(track, images, predicted, view)
-        if first.n_inliers < _MIN_INLIERS_FRAME:
+        first = track_previous_frame(track, images.mask, predicted, view, context)
+        if first.n_inliers < MIN_INLIERS_FRAME:
             return replace(track, n_matches=first.n_inliers)
         local, patches = view.local_landmarks, view.patches
         found = track_local_map(first, local, context, images.mask, patches=patches)
@@ -241,42 +233,6 @@ class Tracker:
             return replace(track, n_matches=found.n_matches, n_inliers=found.n_inliers)
         doubtful = self._is_doubtful(found.n_inliers, predicted, view)
         return replace(found, state=state, by=By.FEATURES, is_doubtful=doubtful)
-
-    def _track_previous_frame(
-        self, track: Track, images: Images, predicted: Prediction, view: MapView
-    ) -> Track:
-        """Find a first pose and first matches of a frame. ``n_inliers`` is 0 if there are none.
-
-        Four methods are tried in turn: tracking against the last frame, tracking against the
-        reference keyframe, ``_track_predicted``, and ``track_sudden_motion``. Only the second
-        method works if the motion is unknown.
-        """
-        config, context, T_cw = self._config.tracking, self._context, predicted.T_cw
-        last, local = predicted.last, view.local_landmarks
-        if last is None and not (predicted.is_resumed and predicted.lost_frames == 0):
-            return track
-        if last is not None and last.twist is not None:
-            found = track_motion(track, last, T_cw, local, context)
-            if self._is_trusted(found, config.min_inlier_ratio):
-                return found
-        found = track_descriptors(track, view.reference_landmarks, T_cw, context)
-        if found.n_inliers >= _MIN_INLIERS_FRAME or predicted.twist is None:
-            return found
-        # After a sudden change in brightness, landmarks that older frames observed may match when
-        # the landmarks of the last frame do not.
-        window, patches = _PREDICTED_WINDOW, view.patches
-        found = track_local_map(track, local, context, images.mask, window, patches)
-        if self._is_trusted(found, config.min_inlier_ratio):
-            return found
-        if last is not None and predicted.is_tracking:
-            found = track_sudden_motion(track, last, T_cw, local, context)
-            if self._is_trusted(found, config.sudden_min_inlier_ratio):
-                return found
-        return track
-
-    def _is_trusted(self, track: Track, min_ratio: float) -> bool:
-        least = max(MIN_INLIERS_MOTION, min_ratio * track.n_matches)
-        return track.n_inliers >= least
 
     def _is_doubtful(self, n_inliers: int, predicted: Prediction, view: MapView) -> bool:
         """Return whether a frame has few inliers and there is another reason why its matches may be

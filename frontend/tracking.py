@@ -23,13 +23,14 @@ from vslam.frontend.matching import (
 )
 from vslam.frontend.pnp import ransac_pose
 from vslam.frontend.pose import MIN_TRUSTED, offset_effect, optimise_pose, pose_covariance
-from vslam.frontend.track import Track
+from vslam.frontend.prediction import Prediction
 from vslam.types.camera import DISPARITY_WEIGHT, Camera
 from vslam.types.context import Context
 from vslam.types.features import NO_PATCHES, Features, LandmarkPatches, TrackingState
 from vslam.types.geometry import Matrix, compose, inverse, transform
-from vslam.types.map_view import LocalMap
+from vslam.types.map_view import LocalMap, MapView
 from vslam.types.reprojection import stack_uvr
+from vslam.types.track import Track
 
 # Upper bound of the descriptor distance when landmarks are matched near their projections, in
 # bits. [OS1 V-D, customary]
@@ -52,6 +53,13 @@ MIN_INLIERS_MOTION = 20
 # A frame of an RGB-D camera is also LOST if less than this fraction of its matches are inliers.
 # [own]
 _DEPTH_MIN_INLIER_RATIO = 0.2
+# Replaces `local_window` for a frame that could be matched with neither the previous frame nor
+# the reference keyframe, in pixels at octave 0. [own]
+_PREDICTED_WINDOW = 7.0
+# A frame is matched with the local map only if tracking from the previous frame, from the
+# reference keyframe, with `predicted_window` or with `sudden_window` gives at least this many
+# inliers. Otherwise, the frame is LOST. [OS1 V-B, customary]
+MIN_INLIERS_FRAME = 10
 # A frame with fewer inliers than this in the local map is LOST. Its pose is only predicted. [own]
 MIN_INLIERS_LOST = 15
 # Upper bound of the number of RANSAC draws. [OS1 V-C, own]
@@ -65,6 +73,46 @@ def feature_depth(features: Features, camera: Camera) -> NDArray[np.float64]:
     """Compute the ``(N,)`` float64 stereo depth of each feature, in metres; NaN without a stereo
     match."""
     return camera.bf / (features.xy[:, 0].astype(np.float64) - features.u_right)
+
+
+def track_previous_frame(
+    track: Track, mask: Mask | None, predicted: Prediction, view: MapView, context: Context
+) -> Track:
+    """Find a first pose and first matches of a frame. ``n_inliers`` is 0 if there are none.
+
+    Four methods are tried in turn: tracking against the last frame, tracking against the reference
+    keyframe, matching the local map in a wider window, and ``track_sudden_motion``. Only the second
+    method works if the motion is unknown.
+
+    Args:
+        track: the frame with its features, which are not matched yet.
+        mask: the mask of the image; None uses all pixels.
+    """
+    config, T_cw = context.config.tracking, predicted.T_cw
+    last, local = predicted.last, view.local_landmarks
+    if last is None and not (predicted.is_resumed and predicted.lost_frames == 0):
+        return track
+    if last is not None and last.twist is not None:
+        found = track_motion(track, last, T_cw, local, context)
+        if _is_trusted(found, config.min_inlier_ratio):
+            return found
+    found = track_descriptors(track, view.reference_landmarks, T_cw, context)
+    if found.n_inliers >= MIN_INLIERS_FRAME or predicted.twist is None:
+        return found
+    # After a sudden change in brightness, landmarks that older frames observed may match when the
+    # landmarks of the last frame do not.
+    found = track_local_map(track, local, context, mask, _PREDICTED_WINDOW, view.patches)
+    if _is_trusted(found, config.min_inlier_ratio):
+        return found
+    if last is not None and predicted.is_tracking:
+        found = track_sudden_motion(track, last, T_cw, local, context)
+        if _is_trusted(found, config.sudden_min_inlier_ratio):
+            return found
+    return track
+
+
+def _is_trusted(track: Track, min_ratio: float) -> bool:
+    return track.n_inliers >= max(MIN_INLIERS_MOTION, min_ratio * track.n_matches)
 
 
 def track_motion(

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vslam.frontend.track import By, Track
 from vslam.support.workers import Job, Urgency, Workers
 from vslam.types.camera import Camera
 from vslam.types.features import Extracted, Features, TrackingState
 from vslam.types.geometry import se3_exp, transform
 from vslam.types.map_view import LocalMap, MapView
+from vslam.types.track import By, Track
 
 CAMERA = Camera(400.0, 400.0, 320.0, 120.0, 0.5, 640, 240)
 ALL, NOTHING = slice(None), slice(0, 0)  # all points of a ``Points``, and none of them

@@ -196,7 +196,13 @@ def video(folder: Path) -> None:
 def map_file(folder: Path) -> None:
     from vslam.maps.storage import save_map
     from vslam.maps.stored_map import StoredMap
-    from vslam.types.features import PATCH_PIXELS, Features, FramePatches, KeyframePatches
+    from vslam.types.features import (
+        PATCH_PIXELS,
+        Extracted,
+        Features,
+        FramePatches,
+        KeyframePatches,
+    )
     from vslam.types.frame_poses import FrameTable
     from vslam.types.loops import LoopEdge, ResembledPlace
     from vslam.types.map import Map
@@ -205,10 +211,11 @@ def map_file(folder: Path) -> None:
         Checkpoint,
         ClosingState,
         ConsistencyState,
-        MapperState,
+        MotionState,
         PolicyState,
-        TrackerState,
+        PublishedState,
     )
+    from vslam.types.track import Track
 
     rng = np.random.default_rng(3)
     map_ = Map(1.2 ** np.arange(8))
@@ -243,9 +250,12 @@ def map_file(folder: Path) -> None:
         patches.pixels[2:],
         patches.shift[2:],
     )
+    last = Track(2, 0.2, np.eye(4), twist=np.zeros(6)).with_features(Extracted(features))
+    last = last.matching(np.arange(n), ids.astype(np.int32), map_.arrays.xyz[ids])
     checkpoint = Checkpoint(
-        TrackerState(2, 0.2, features, ids.astype(np.int32), np.eye(4), np.zeros(6), 0, n),
-        MapperState(2, 2, 0.2, (patches,), known_place),
+        last,
+        MotionState(),
+        PublishedState(2, 2, 0.2, (patches,), known_place),
         PolicyState(100.0, False),
         ClosingState(ConsistencyState((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3)),
     )

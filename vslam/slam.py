@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vslam.config import Config, as_config
 from vslam.frontend.extraction import FrameImages, checked_images
-from vslam.frontend.track import GivenFeatures, Track
+from vslam.frontend.images import GivenFeatures
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.names import DEFAULT_DETECTOR
 from vslam.loopclosure.registry import detector_with_images
@@ -31,6 +31,7 @@ from vslam.types.features import Extracted, TrackResult
 from vslam.types.imu import ImuCalibration, tidied
 from vslam.types.loops import LoopCorrection, LoopEdge
 from vslam.types.map import Map
+from vslam.types.track import Track
 from vslam.types.trajectory import Trajectory
 
 

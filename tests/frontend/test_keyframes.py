@@ -16,8 +16,8 @@ from vslam.frontend.keyframes import (
     needs_keyframe,
     needs_monocular_keyframe,
 )
-from vslam.frontend.track import Track
 from vslam.types.context import Context
+from vslam.types.track import Track
 
 CONFIG = KeyframeConfig(
     max_interval_s=1.0,

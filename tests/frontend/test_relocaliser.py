@@ -11,12 +11,13 @@ from test_relocalization import KEYFRAMES, lost_frame, mapped_street
 from test_verification import forward
 
 from vslam.config import Config
+from vslam.frontend.images import GivenFeatures
 from vslam.frontend.relocaliser import Relocaliser
-from vslam.frontend.track import By, GivenFeatures, Track
 from vslam.types.context import Context
 from vslam.types.features import TrackingState
 from vslam.types.geometry import inverse, se3_exp, se3_log
 from vslam.types.loops import LastSeen, Localisation, LoopCandidate
+from vslam.types.track import By, Track
 
 HERE, NOT_HERE = 1, KEYFRAMES  # keyframes: one near the frame, and one without landmarks
 T_TRUE = forward(1.2, 0.3)

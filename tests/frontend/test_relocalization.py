@@ -10,11 +10,11 @@ from test_verification import forward, in_strip, link_pass
 
 from vslam.config import Config, RelocalizationConfig
 from vslam.frontend.relocaliser import relocalised
-from vslam.frontend.track import Track
 from vslam.types.context import Context
 from vslam.types.features import Extracted, Features
 from vslam.types.geometry import inverse, se3_log
 from vslam.types.map_view import NO_LANDMARKS, local_map
+from vslam.types.track import Track
 
 CONTEXT = Context.create(CAMERA, Config())
 KEYFRAMES = 4

@@ -12,11 +12,9 @@ from ring import CAMERA as RING_CAMERA
 from ring import LAP, Ring
 
 from vslam.frontend.rig import RigMonitor, corrected, with_offset
-from vslam.frontend.sides import Sides
-from vslam.frontend.track import GivenFeatures
 from vslam.slam import Slam
 from vslam.types.camera import Camera
-from vslam.types.features import Extracted, Features
+from vslam.types.features import Extracted, Features, Sides
 from vslam.types.geometry import inverse, se3_exp
 from vslam.types.image_motion import columns_without_delay, rays
 
@@ -98,10 +96,10 @@ def test_a_sound_rig_leaves_frames_as_they_are():
 
 def test_what_the_images_of_a_frame_show_is_recorded_even_if_it_is_lost():
     rig, lost = RigMonitor(), frame_of(Extracted.nothing(), 7)
-    rig.observe(lost, GivenFeatures(Extracted.nothing()))
+    rig.observe(lost)
     assert (rig.sides.n, rig.problems) == (0, [])
-    black = GivenFeatures(Extracted.nothing(), sides=Sides(black="left"), problem="it is gone.")
-    rig.observe(lost, black)
+    black = replace(lost.extracted, sides=Sides(black="left"), problem="it is gone.")
+    rig.observe(replace(lost, extracted=black))
     assert (rig.sides.n, rig.sides.n_black_left) == (1, 1)
     assert rig.problems == ["Frame 7 has only its left image: it is gone."]
 

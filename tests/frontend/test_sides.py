@@ -11,10 +11,11 @@ from scipy.ndimage import gaussian_filter
 
 from vslam.config import Config
 from vslam.frontend.extraction import FrameImages
-from vslam.frontend.sides import Sides, balanced, compare_sides, with_pair
+from vslam.frontend.sides import balanced, compare_sides, with_pair
 from vslam.run.rig import measure_offset, offset_warnings, rig_warnings
 from vslam.types.camera import Camera
 from vslam.types.context import Context
+from vslam.types.features import Sides
 from vslam.types.geometry import inverse, se3_exp
 from vslam.types.states import ComparedSides
 

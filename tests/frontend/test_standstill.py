@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vslam.frontend.standstill import has_come_to_rest, is_small, still_stands
-from vslam.types.states import Standstill
+from vslam.types.track import Standstill
 
 
 def first(n: int, of: int) -> np.ndarray:

@@ -9,17 +9,19 @@ import pytest
 from parts import ALL, CAMERA, NOTHING, OneKeyframe, Points, ahead, frame_of
 
 from vslam.config import Config
+from vslam.frontend.images import GivenFeatures
 from vslam.frontend.patch_tracking import NO_PATCHES_FOUND, PatchTrack
-from vslam.frontend.track import By, GivenFeatures, Prediction, Track
+from vslam.frontend.prediction import Prediction
 from vslam.frontend.tracker import Tracker, judge_patches
 from vslam.frontend.tracking import judge, track_descriptors, track_motion, trusted_landmarks
+from vslam.maps.checkpoint import CHECKPOINTS
 from vslam.method.motion import Motion
-from vslam.method.session import restored_track, tracker_state
 from vslam.types.context import Context
 from vslam.types.features import NO_PATCHES, Extracted, Features, TrackingState
 from vslam.types.frame_poses import FramePoses
 from vslam.types.geometry import se3_exp
 from vslam.types.map_view import NO_LANDMARKS, MapView
+from vslam.types.track import By, Track
 
 CONTEXT = Context.create(CAMERA, Config())
 POINTS = Points.create()
@@ -666,10 +668,9 @@ def test_a_drive_that_is_restored_goes_on_as_the_one_that_was_not(make, lost):
     drive = make()
     for k in range(lost):
         drive.lose(2 + k)
-    state = tracker_state(drive.last, drive.motion.lost_frames)
-    last = replace(restored_track(state, CONTEXT), xyz=drive.last.xyz)
-    motion = Motion(CONTEXT, drive.frames)
-    motion.lost_frames = state.lost_frames
+    entry, arrays = CHECKPOINTS.encode(drive.last, "last")
+    last = CHECKPOINTS.decode(Track, entry, arrays)
+    motion = Motion(CONTEXT, drive.frames, state=drive.motion.state)
     view, outcomes = POINTS.view(nearest=NOTHING, n_reference=240, n_keyframes=OLD), []
     frame = drive.next_frame(FEW)
     for one in ((drive.last, drive.motion), (last, motion)):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from vslam.config import Config, OrbConfig, TrackingConfig, WeakImageConfig
-from vslam.frontend import tracker
+from vslam.frontend import tracking
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.orb import extract
 from vslam.frontend.stereo import inliers_only, match_stereo
@@ -207,7 +207,7 @@ def test_what_the_frame_before_did_not_see_is_matched_around_the_prediction(
     The two frames have no landmarks in common, but the map contains those of both. Without a search
     around the prediction, the second frame would be lost.
     """
-    monkeypatch.setattr(tracker, "_PREDICTED_WINDOW", window)
+    monkeypatch.setattr(tracking, "_PREDICTED_WINDOW", window)
     by_features = Config(orb=ORB, tracking=TrackingConfig(method="orb"))
     slam = Slam(corridor.camera, by_features, threads=1)
     half = corridor.camera.width // 2

@@ -403,7 +403,7 @@ def test_damage_by_hand_is_refused(apply, file, tmp_path):
     assert "damaged" in refusal(apply(file, tmp_path / "hand.npz"))
 
 
-TRACKER, PLACE = "checkpoint.tracker", "checkpoint.mapper.known_place"
+LAST, PLACE = "checkpoint.last", "checkpoint.published.known_place"
 FAR = {"keyframes": [10**6], "length": 1, "age": 0}
 
 
@@ -473,27 +473,29 @@ def alive_that_died(file: Path, to: Path) -> Path:
 @pytest.mark.parametrize(
     "apply",
     [
-        damage(f"{TRACKER}.landmark", (3,), 10**6),
-        damage(f"{TRACKER}.landmark", (3,), -2),
-        damage(f"{TRACKER}.features.xy", (3, 0), np.nan),
-        damage(f"{TRACKER}.features.xy", (3, 0), 1e30),
-        damage(f"{TRACKER}.features.octave", (3,), 8),
-        damage(f"{TRACKER}.features.u_right", (3,), np.inf),
+        damage(f"{LAST}.landmark", (3,), 10**6),
+        damage(f"{LAST}.landmark", (3,), -2),
+        damage(f"{LAST}.visible", (3,), 10**6),
+        damage(f"{LAST}.xyz", (3, 0), np.inf),
+        damage(f"{LAST}.extracted.features.xy", (3, 0), np.nan),
+        damage(f"{LAST}.extracted.features.xy", (3, 0), 1e30),
+        damage(f"{LAST}.extracted.features.octave", (3,), 8),
+        damage(f"{LAST}.extracted.features.u_right", (3,), np.inf),
         damage("keyframe_alive", (1,), False),
         damage("landmark_merged_into", (0,), 10**6),
-        entry("mapper", reference=10**6),
-        entry("mapper", reference=0.5),
-        entry("mapper", last_frame=2**31),
-        entry("mapper", last_timestamp=np.inf),
-        entry("tracker", index=2**31),
-        entry("tracker", index=-1),
-        entry("tracker", lost_frames=10**30),
-        entry("tracker", timestamp=np.inf),
-        entry("tracker", n_tracked="many"),
-        entry("tracker", unknown=1),
-        entry("tracker", T_cw="checkpoint.tracker.twist"),
-        entry("tracker", T_cw=None),
-        entry("tracker", T_cw="nothing"),
+        entry("published", reference=10**6),
+        entry("published", reference=0.5),
+        entry("published", last_frame=2**31),
+        entry("published", last_timestamp=np.inf),
+        entry("last", index=2**31),
+        entry("last", index=-1),
+        entry("motion", lost_frames=10**30),
+        entry("last", timestamp=np.inf),
+        entry("last", n_inliers="many"),
+        entry("last", unknown=1),
+        entry("last", T_cw="checkpoint.last.twist"),
+        entry("last", T_cw=None),
+        entry("last", T_cw="nothing"),
         entry("closing", consistency={"places": [[1]], "verified": [], "turn": 1}),
         entry("closing", consistency={"places": [FAR], "verified": [], "turn": 1}),
         entry("closing", consistency={"places": [], "verified": [], "turn": np.inf}),
@@ -518,7 +520,7 @@ def at_known_place(tmp_path_factory) -> Path:
 
 def test_the_patches_of_a_known_place_come_back(at_known_place, tmp_path):
     stored = load_checkpoint(at_known_place)
-    known_place = stored.checkpoint.mapper.known_place
+    known_place = stored.checkpoint.published.known_place
     with np.load(at_known_place) as data:
         for name, values in known_place._asdict().items():
             wanted = 2 if name == "frame" else data[f"{PLACE}.{name}"]
@@ -536,8 +538,8 @@ def test_the_patches_of_a_known_place_come_back(at_known_place, tmp_path):
         damage(f"{PLACE}.octave", (3,), 8),
         damage(f"{PLACE}.angle", (3,), np.inf),
         damage(f"{PLACE}.shift", (3, 0), np.nan),
-        entry("mapper", known_place=3),
-        entry("mapper", known_place="last"),
+        entry("published", known_place=3),
+        entry("published", known_place="last"),
     ],
 )
 def test_damaged_patches_of_a_known_place_are_refused(apply, at_known_place, tmp_path):
@@ -556,10 +558,10 @@ def test_a_drive_that_has_made_no_keyframe_yet_is_resumed(at_checkpoint, tmp_pat
     path = tmp_path / "m.npz"
     begun = {"last_frame": -1, "last_timestamp": -np.inf}
     header = header_of(at_checkpoint)
-    header["checkpoint"]["state"]["mapper"] |= begun
+    header["checkpoint"]["state"]["published"] |= begun
     changed(at_checkpoint, path, header=as_header(header))
-    mapper = load_checkpoint(path).checkpoint.mapper
-    assert {name: getattr(mapper, name) for name in begun} == begun
+    published = load_checkpoint(path).checkpoint.published
+    assert {name: getattr(published, name) for name in begun} == begun
 
 
 def test_observations_that_contradict_each_other_are_refused(file, tmp_path):

@@ -14,7 +14,6 @@ from vslam.config import Config
 from vslam.frontend.orb import build_pyramid
 from vslam.frontend.patches import patches_around
 from vslam.frontend.rig import with_offset
-from vslam.frontend.track import Track
 from vslam.frontend.tracking import track_local_map
 from vslam.loopclosure.detector import NoDetector
 from vslam.method.closing import LoopSearch
@@ -33,7 +32,8 @@ from vslam.types.map import Map
 from vslam.types.map_kernels import erase_landmark
 from vslam.types.map_view import MapView
 from vslam.types.revisits import MAX_REVISITS
-from vslam.types.states import MapperState
+from vslam.types.states import PublishedState
+from vslam.types.track import Track
 
 POINTS = Points.create()
 RING = ring.Ring.create(zoom=True)
@@ -123,9 +123,14 @@ class Drive:
         self._see, self._at = see, poses
 
     def continue_in(
-        self, map_: Map | None, frames: FrameTable | None = None, workers: Workers | None = None
+        self,
+        map_: Map | None,
+        frames: FrameTable | None = None,
+        state: PublishedState | None = None,
+        workers: Workers | None = None,
     ) -> None:
-        self.mapper = Mapper(self.context, self.closing, workers or Workers(1), map_, frames)
+        workers = workers or Workers(1)
+        self.mapper = Mapper(self.context, self.closing, workers, map_, frames, state)
         self.published = self.mapper.published
 
     def next_frame(self) -> Track:
@@ -583,8 +588,7 @@ def test_at_a_known_place_the_patches_are_those_of_the_frame_until_the_next_keyf
     np.testing.assert_allclose(shown.T_cw[shown.view[0]], frame.T_cw, atol=1e-12)
 
     again = Drive()
-    again.continue_in(published.map.copy(), published.frames.table())
-    again.published.restore(published.state())
+    again.continue_in(published.map.copy(), published.frames.table(), published.state())
     assert bytes_of_view(again.published.view) == bytes_of_view(published.view)
 
     drive.step(keyframe=True)
@@ -758,8 +762,8 @@ def test_a_mapper_that_is_restored_goes_on_as_the_one_that_was_not():
     other = Drive()
     other.continue_in(map_.copy(), one.published.frames.table())
     assert other.published.reference == 1  # the newest keyframe, where nothing else is known
-    other.published.restore(state)
-    assert other.published.state() == state == MapperState(0, 3, pytest.approx(0.3), ())
+    other.continue_in(map_.copy(), one.published.frames.table(), state)
+    assert other.published.state() == state == PublishedState(0, 3, pytest.approx(0.3), ())
     assert bytes_of_view(other.published.view) == bytes_of_view(one.published.view)
     for drive in (one, other):
         drive.last = None
@@ -784,7 +788,8 @@ def test_the_patches_of_keyframes_are_part_of_the_state():
         )
         for keyframe in (0, 1)
     )
-    drive.published.restore(MapperState(1, 3, 0.3, patches))
+    map_, frames = drive.published.map.copy(), drive.published.frames.table()
+    drive.continue_in(map_, frames, PublishedState(1, 3, 0.3, patches))
     again = drive.published.state().patches
     assert len(again) == 2
     for mine, theirs in zip(again, patches, strict=True):
@@ -803,6 +808,5 @@ def test_only_the_same_drive_counts_frames_from_its_newest_keyframe(same_drive):
     if not same_drive:
         map_.begin_drive()
     drive.continue_in(map_, drive.published.frames.table())
-    drive.published.continue_drive()
     assert drive.published.last_frame == (3 if same_drive else -1)
     assert drive.published.last_timestamp == (map_.timestamps[1] if same_drive else -np.inf)

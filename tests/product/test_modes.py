@@ -9,13 +9,15 @@ import pytest
 from parts import CAMERA, Points, ahead
 from test_mapper import Drive, at, begin_with_two_views, bytes_of_map, see_points, see_without_depth
 
-from vslam.frontend.track import By, GivenFeatures, Prediction, Track
+from vslam.frontend.images import GivenFeatures
+from vslam.frontend.prediction import Prediction
 from vslam.frontend.tracker import Tracker
 from vslam.method.map_frames import OldPlace
 from vslam.method.modes import Building, Localising
 from vslam.types.camera import Camera
 from vslam.types.features import TrackingState
-from vslam.types.states import PolicyState, Standstill
+from vslam.types.states import PolicyState
+from vslam.types.track import By, Standstill, Track
 
 POINTS = Points.create()
 TWIST = np.array([0.0, 0.0, -2.0, 0.0, 0.0, 0.0])
@@ -79,7 +81,6 @@ def test_localising_leaves_the_map_alone():
     assert mode.map_far_points(drive.last) is None
     assert drive.update(lost) is lost
     assert drive.update(tracked) is tracked
-    mode.restore(PolicyState(1.0, True))
     drive.mapper.finish()
     assert bytes_of_map(published.map) == before
     assert published.n_keyframes == 2
@@ -269,7 +270,7 @@ def test_a_frame_that_is_not_urgent_waits_for_mapping(idle, made):
 def test_at_an_old_place_no_keyframe_is_made(known_after_s, known):
     drive = Mapped.with_a_map(max_interval_s=0.05, known_after_s=known_after_s)
     frame = drive.recorded_frame()
-    drive.mode.restore(PolicyState(100.0, gain_awaited=False))
+    drive.mode.policy.state = PolicyState(100.0, gain_awaited=False)
     assert drive.update(frame).is_keyframe != known
     assert drive.published.n_keyframes == (2 if known else 3)
     assert drive.published.reference == (0 if known else 2)
@@ -284,7 +285,7 @@ def test_a_place_is_known_by_the_features_of_a_frame_that_was_tracked_by_patches
     others = np.flatnonzero(by_features.landmark >= 0)[40:]
     frame = replace(by_features.without(others), by=By.PATCHES)
     drive.mode._tracker.match_features = lambda *_: by_features
-    drive.mode.restore(PolicyState(100.0, gain_awaited=False, due=frame.index))
+    drive.mode.policy.state = PolicyState(100.0, gain_awaited=False, due=frame.index)
     assert drive.update(frame) is by_features
     assert drive.published.n_keyframes == 2
     assert drive.published.reference == 0
@@ -317,7 +318,7 @@ def test_a_frame_that_is_tracked_ends_the_wait_for_a_second_view():
 
 
 def test_a_mode_that_is_restored_remembers_what_the_other_did():
-    drive, other = Mapped(), Mapped()
+    drive = Mapped()
     drive.mode.begin(drive.lost_frame(), None)
-    other.mode.restore(drive.mode.state())
-    assert other.mode.state() == drive.mode.state() == PolicyState(200.0, True)
+    other = Building(drive.context, drive.mapper, Tracker(drive.context), drive.mode.state())
+    assert other.state() == drive.mode.state() == PolicyState(200.0, True)

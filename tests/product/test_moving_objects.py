@@ -240,7 +240,7 @@ def test_a_run_that_is_resumed_at_a_standstill_gives_the_same_bytes(covered_driv
     follow(slam, pairs[:cut])
     stored = slam.stored_map()
     assert stored.checkpoint is not None
-    assert stored.checkpoint.tracker.standstill is not None
+    assert stored.checkpoint.last.still is not None
     slam.save(tmp_path / "map.npz", resumable=True)
     again = Slam.load(tmp_path / "map.npz", Config(), "none", resume=True, threads=1)
     follow(again, pairs, cut)

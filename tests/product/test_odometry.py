@@ -29,8 +29,10 @@ from vslam.types.geometry import adjoint, inverse, se3_exp, se3_log
 from vslam.types.odometry import (
     CORRELATION,
     DRIFT,
-    Odometry,
+    OdometryState,
     PoseUncertainty,
+    at_keyframe,
+    moved,
     predicted_covariance,
     relative_covariance,
 )
@@ -127,16 +129,16 @@ def test_the_error_of_the_offset_adds_up_along_a_drive():
     """
     effect = np.zeros((6, 3))
     effect[:3] = 0.001 * np.eye(3)
-    model, states = Odometry(), []
+    model, states = OdometryState(), []
     ahead = se3_exp(np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0]))
     for k in range(20):
-        states.append(model.state.now)
-        model.move(ahead if k < 10 else inverse(ahead), 0.1, 1e-12 * np.eye(6), effect)
+        states.append(model.now)
+        model = moved(model, ahead if k < 10 else inverse(ahead), 0.1, 1e-12 * np.eye(6), effect)
     share = [state.covariance[2, 2] for state in (states[5], states[10])]
     np.testing.assert_allclose(share, np.square([5e-3, 10e-3]), rtol=1e-3)
     between = relative_covariance(states[3], states[8], np.linalg.matrix_power(ahead, 5))
     assert between[2, 2] == pytest.approx(5e-3**2, rel=1e-3)
-    assert model.state.now.covariance[2, 2] < 1e-10
+    assert model.now.covariance[2, 2] < 1e-10
 
 
 def test_too_few_observations_have_no_covariance():
@@ -154,39 +156,37 @@ def test_the_drift_grows_as_the_sum_of_correlated_steps_does():
         noise = np.sqrt(1.0 - CORRELATION**2) * rng.normal(size=len(steps))
         steps[:, k] = CORRELATION * steps[:, k - 1] + noise
     still = PoseUncertainty(np.zeros((6, 6)), np.zeros((6, 6)), 0)
-    moved = PoseUncertainty(np.zeros((6, 6)), n * np.eye(6), n)
-    predicted = relative_covariance(still, moved, np.eye(4))[0, 0]
+    later = PoseUncertainty(np.zeros((6, 6)), n * np.eye(6), n)
+    predicted = relative_covariance(still, later, np.eye(4))[0, 0]
     assert DRIFT * steps.sum(axis=1).var() == pytest.approx(predicted, rel=0.05)
 
 
 def test_the_drift_before_both_frames_does_not_count():
-    model = Odometry()
-    model.move(np.eye(4), 0.0, some_covariance())
-    model.keyframe()
-    first = model.state.now
-    model.move(MOTION, 0.1, some_covariance(2.0, 1))
+    model = OdometryState()
+    model = moved(model, np.eye(4), 0.0, some_covariance())
+    model = at_keyframe(model)
+    first = model.now
+    model = moved(model, MOTION, 0.1, some_covariance(2.0, 1))
     A = adjoint(MOTION)
     expected = some_covariance(2.0, 1) + A @ some_covariance() @ A.T
-    np.testing.assert_allclose(
-        relative_covariance(first, model.state.now, MOTION), expected, atol=1e-9
-    )
-    model.keyframe()
-    grown = relative_covariance(first, model.state.now, MOTION) - expected
+    np.testing.assert_allclose(relative_covariance(first, model.now, MOTION), expected, atol=1e-9)
+    model = at_keyframe(model)
+    grown = relative_covariance(first, model.now, MOTION) - expected
     np.testing.assert_allclose(grown, DRIFT * some_covariance(2.0, 1), atol=1e-9)
-    assert (np.linalg.eigvalsh(model.state.now.covariance - first.local) > 0).all()
+    assert (np.linalg.eigvalsh(model.now.covariance - first.local) > 0).all()
 
 
 def test_a_pose_that_is_predicted_gets_less_sure_with_the_square_of_the_time():
-    model = Odometry()
-    model.move(np.eye(4), 0.0, some_covariance(1e-10))
+    model = OdometryState()
+    model = moved(model, np.eye(4), 0.0, some_covariance(1e-10))
     deviations = []
     for covariance in (None, None, np.full((6, 6), np.nan), None):
-        model.move(np.eye(4), 0.15, covariance)
-        deviations.append(np.sqrt(np.diag(model.state.now.local)))
+        model = moved(model, np.eye(4), 0.15, covariance)
+        deviations.append(np.sqrt(np.diag(model.now.local)))
     ratio = np.array(deviations)[1:] / deviations[0]
     np.testing.assert_allclose(ratio, np.array([4.0, 9.0, 16.0])[:, None] * np.ones(6), rtol=1e-3)
-    model.move(np.eye(4), 0.15, some_covariance(1e-6))
-    assert np.diag(model.state.now.local).max() < 1e-4
+    model = moved(model, np.eye(4), 0.15, some_covariance(1e-6))
+    assert np.diag(model.now.local).max() < 1e-4
 
 
 def turned(seconds: float) -> np.ndarray:
@@ -197,49 +197,47 @@ def turned(seconds: float) -> np.ndarray:
 @pytest.mark.parametrize("begins_submap", [False, True])
 def test_the_error_of_a_prediction_stays_in_the_poses_after_it(begins_submap):
     """The camera is found again in the map, or begins a sub-map. The odometry does not catch up."""
-    model, still = Odometry(), 1e-10 * np.eye(6)
-    model.move(np.eye(4), 0.0, still)
-    model.keyframe()
-    known = model.state.now
+    model, still = OdometryState(), 1e-10 * np.eye(6)
+    model = moved(model, np.eye(4), 0.0, still)
+    model = at_keyframe(model)
+    known = model.now
     for _ in range(19):
-        model.move(turned(0.1), 0.1, None)
+        model = moved(model, turned(0.1), 0.1, None)
     if begins_submap:
-        model.move(turned(0.1), 0.1, None)
-        model.keyframe()
+        model = moved(model, turned(0.1), 0.1, None)
+        model = at_keyframe(model)
     else:
-        model.move(turned(0.1), 0.1, still, found_again=True)
+        model = moved(model, turned(0.1), 0.1, still, found_again=True)
     expected = predicted_covariance(turned(2.0), 2.0)
-    np.testing.assert_allclose(model.state.now.covariance, expected, rtol=0.1, atol=1e-3)
-    np.testing.assert_allclose(relative_covariance(known, model.state.now, turned(2.0)),
-                               model.state.now.covariance, atol=1e-6)  # fmt: skip
-    assert np.diag(model.state.now.local).max() < 1e-9
-    after = model.state.now
+    np.testing.assert_allclose(model.now.covariance, expected, rtol=0.1, atol=1e-3)
+    np.testing.assert_allclose(relative_covariance(known, model.now, turned(2.0)),
+                               model.now.covariance, atol=1e-6)  # fmt: skip
+    assert np.diag(model.now.local).max() < 1e-9
+    after = model.now
     for _ in range(20):
-        model.move(turned(0.1), 0.1, still)
-        model.keyframe()
-    assert np.diag(relative_covariance(after, model.state.now, turned(2.0))).max() < 1e-6
-    assert np.linalg.det(model.state.now.covariance) > 0.9 * np.linalg.det(expected)
+        model = moved(model, turned(0.1), 0.1, still)
+        model = at_keyframe(model)
+    assert np.diag(relative_covariance(after, model.now, turned(2.0))).max() < 1e-6
+    assert np.linalg.det(model.now.covariance) > 0.9 * np.linalg.det(expected)
 
 
 def test_the_motion_before_the_first_tracked_frame_is_not_part_of_the_uncertainty():
-    begun, found = Odometry(), Odometry()
-    for model in (begun, found):
-        for _ in range(10):
-            model.move(np.eye(4), 0.1, None)
-    begun.keyframe()
-    assert not begun.state.now.covariance.any()
-    found.move(np.eye(4), 0.1, some_covariance(1e-6), found_again=True)
-    np.testing.assert_allclose(found.state.now.covariance, some_covariance(1e-6))
+    model = OdometryState()
+    for _ in range(10):
+        model = moved(model, np.eye(4), 0.1, None)
+    assert not at_keyframe(model).now.covariance.any()
+    found = moved(model, np.eye(4), 0.1, some_covariance(1e-6), found_again=True)
+    np.testing.assert_allclose(found.now.covariance, some_covariance(1e-6))
 
 
 def test_a_prediction_without_a_velocity_is_much_less_sure():
     deviations = []
     for known in (True, False):
-        model = Odometry()
-        model.move(np.eye(4), 0.0, some_covariance(1e-6))
+        model = OdometryState()
+        model = moved(model, np.eye(4), 0.0, some_covariance(1e-6))
         for _ in range(10):
-            model.move(np.eye(4), 0.1, None, known_velocity=known)
-        deviations.append(np.sqrt(model.state.now.covariance[2, 2]))
+            model = moved(model, np.eye(4), 0.1, None, known_velocity=known)
+        deviations.append(np.sqrt(model.now.covariance[2, 2]))
     assert deviations[0] == pytest.approx(0.5, rel=0.05)
     assert 5.0 < deviations[1] < 20.0
 

@@ -8,10 +8,10 @@ from parts import ALL, CAMERA, Points, frame_of
 
 from vslam.config import Config
 from vslam.frontend import initialization
-from vslam.frontend.track import Track
 from vslam.method.starter import Starter, TwoViewStart
 from vslam.types.context import Context
 from vslam.types.geometry import se3_exp, se3_log, transform
+from vslam.types.track import Track
 
 POINTS = Points.create()
 ASIDE = np.array([-1.0, 0.0, 0.1, 0.0, 0.01, 0.0])  # twist to a view from which points are mapped

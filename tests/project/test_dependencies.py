@@ -61,7 +61,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
         "vslam.types.map_kernels",
         "vslam.calibration",
     ),
-    ("vslam.types.revisits",),
+    ("vslam.types.revisits", "vslam.types.track"),
     ("vslam.types.map", "vslam.types.frame_poses", "vslam.types.states"),
     ("vslam.types.map_view", "vslam.method.shared_map"),
     ("vslam.frontend", "vslam.backend", "vslam.loopclosure", "vslam.datasets", "vslam.maps"),

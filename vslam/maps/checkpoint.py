@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from vslam.maps.codec import Codec
 from vslam.types.features import PATCH_PIXELS
 from vslam.types.map import Map
-from vslam.types.states import Checkpoint, MapperState, TrackerState
+from vslam.types.states import Checkpoint, PublishedState
+from vslam.types.track import Track
 
-SCHEMA = 4
+SCHEMA = 5
 _MOST = 1e12  # metres, pixels or seconds
 LOOP_SHAPES = {
     "LoopEdge.T_query_match": (4, 4),
@@ -30,10 +31,18 @@ CHECKPOINTS = Codec(
         "Features.angle": ("N",),
         "Features.descriptors": ("N", 32),
         "Features.u_right": ("N",),
-        "TrackerState.landmark": ("N",),
-        "TrackerState.T_cw": (4, 4),
-        "TrackerState.twist": (6,),
-        "TrackerState.coarse": ("Q",),
+        # Only the pyramid of a new keyframe is needed.
+        "Extracted.pyramid": None,
+        "Track.T_cw": (4, 4),
+        "Track.landmark": ("N",),
+        "Track.xyz": ("N", 3),
+        "Track.shift": ("N", 2),
+        "Track.visible": ("V",),
+        "Track.twist": (6,),
+        "Pyramid.pixels": ("Q",),
+        "Pyramid.offsets": ("L",),
+        "Pyramid.shapes": ("L", 2),
+        "Pyramid.scales": ("L",),
         "Standstill.T_cw": (4, 4),
         "Standstill.ids": ("N",),
         "Standstill.xy": ("N", 2),
@@ -59,7 +68,15 @@ CHECKPOINTS = Codec(
         "InertialState.covariance": (18, 18),
     },
     most=_MOST,
-    unbounded=frozenset(("Features.u_right", "MapperState.last_timestamp", "LoopEdge.covariance")),
+    unbounded=frozenset(
+        (
+            "Features.u_right",
+            "Track.xyz",
+            "Track.shift",
+            "PublishedState.last_timestamp",
+            "LoopEdge.covariance",
+        )
+    ),
 )
 
 
@@ -81,9 +98,9 @@ def checked_checkpoint(
     edges = [edge for _, edge in consistency.verified]
     ends = [end for edge in edges for end in (edge.query, edge.match)]
     for names, holds in {
-        "the last frame": _is_last_frame(checkpoint.tracker, map_, n_frames),
-        "the last keyframe": _is_last_keyframe(checkpoint.mapper, map_, n_frames),
-        "the patches": _are_patches(checkpoint.mapper, map_, n_frames),
+        "the last frame": _is_last_frame(checkpoint.last, map_, n_frames),
+        "the last keyframe": _is_last_keyframe(checkpoint.published, map_, n_frames),
+        "the patches": _are_patches(checkpoint.published, map_, n_frames),
         "a verified loop": _are_ids(ends, map_.n_keyframes)
         and all(edge.T_query_match is not None and edge.scale > 1 / _MOST for edge in edges),
         "a resembled place": all(
@@ -95,33 +112,36 @@ def checked_checkpoint(
     return checkpoint
 
 
-def _is_last_frame(tracker: TrackerState, map_: Map, n_frames: int) -> bool:
-    features, landmark = tracker.features, tracker.landmark
+def _is_last_frame(last: Track, map_: Map, n_frames: int) -> bool:
+    features, landmark, observed = last.features, last.landmark, last.landmark[:, None] >= 0
     return (
-        0 <= tracker.index < n_frames
+        0 <= last.index < n_frames
         and len(landmark) == len(features)
         and _are_ids(landmark, map_.n_landmarks, least=-1)
+        and _are_ids(last.visible, map_.n_landmarks)
         and _are_ids(features.octave, len(map_.scales))
         and not (np.abs(features.u_right) >= _MOST).any()  # it may be NaN
+        and bool(((np.abs(last.xyz) < _MOST) | (np.isnan(last.xyz) & ~observed)).all())
+        and (last.shift is None or not (np.abs(last.shift) >= _MOST).any())
     )
 
 
-def _is_last_keyframe(mapper: MapperState, map_: Map, n_frames: int) -> bool:
+def _is_last_keyframe(published: PublishedState, map_: Map, n_frames: int) -> bool:
     # A drive that continues in a stored map has the values -1 and -inf until its first keyframe.
-    last_timestamp = mapper.last_timestamp
+    last_timestamp = published.last_timestamp
     return (
-        0 <= mapper.reference < map_.n_keyframes
-        and bool(map_.arrays.keyframe_alive[mapper.reference])
-        and mapper.last_frame < n_frames
+        0 <= published.reference < map_.n_keyframes
+        and bool(map_.arrays.keyframe_alive[published.reference])
+        and published.last_frame < n_frames
         and (last_timestamp == -np.inf or abs(last_timestamp) < _MOST)
     )
 
 
-def _are_patches(mapper: MapperState, map_: Map, n_frames: int) -> bool:
-    n_rows, place = np.diff(map_.arrays.first_row[: map_.n_keyframes + 1]), mapper.known_place
+def _are_patches(published: PublishedState, map_: Map, n_frames: int) -> bool:
+    n_rows, place = np.diff(map_.arrays.first_row[: map_.n_keyframes + 1]), published.known_place
     return all(
         0 <= one.keyframe < len(n_rows) and len(one.shift) == n_rows[one.keyframe]
-        for one in mapper.patches
+        for one in published.patches
     ) and (
         place is None
         or (

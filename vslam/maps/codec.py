@@ -30,8 +30,8 @@ class Codec:
 
     Attributes:
         shapes: shape of each array, such as ``{"Features.xy": ("N", 2)}``. Lengths with the same
-            letter must be equal within an object. An array with the shape None is not stored, and
-            is read as None; its annotation is ``X | None``.
+            letter must be equal within an object. A field with the shape None is not stored, and is
+            read as None; its annotation is ``X | None``.
         most: upper bound of the absolute values of floating-point numbers. If it is None, numbers
             may also be infinite or NaN.
         unbounded: fields to which ``most`` does not apply, such as "Features.u_right".
@@ -53,10 +53,10 @@ class Codec:
     def _entry(self, value: Any, path: str, field: str, arrays: dict[str, NDArray]) -> Any:
         if value is None or type(value) in _PLAIN:  # most values
             return value
+        if field in self.shapes and self.shapes[field] is None:
+            return None
         if isinstance(value, np.ndarray):
-            if self.shapes[field] is None:
-                return None
-            arrays[path] = value
+            arrays[path] = np.ascontiguousarray(value)
             return path
         if is_dataclass(value) or hasattr(value, "_fields"):
             return {

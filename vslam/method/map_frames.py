@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.frontend.rig import with_offset
-from vslam.frontend.track import Track
 from vslam.method.hypotheses import joined_submaps
 from vslam.method.starter import TwoViewStart
 from vslam.types.features import TrackingState
@@ -31,6 +30,7 @@ from vslam.types.map_kernels import (
 from vslam.types.map_view import MapView
 from vslam.types.reprojection import stack_uvr
 from vslam.types.revisits import MAX_REVISITS, Revisits
+from vslam.types.track import Track
 from vslam.types.trajectory import Trajectory
 
 _STRETCH = 10  # keyframes of a stretch after which a place is old

@@ -12,7 +12,6 @@ from vslam.backend.disparity_offset import map_and_calibrate
 from vslam.backend.local_mapping import MIN_SHARED, refresh_keyframe
 from vslam.backend.triangulation import map_stereo_points
 from vslam.frontend.patches import certainty_of
-from vslam.frontend.track import Track
 from vslam.method.closing import LoopClosing
 from vslam.method.map_frames import (
     OldPlace,
@@ -31,6 +30,8 @@ from vslam.types.camera import Image
 from vslam.types.context import Context
 from vslam.types.frame_poses import FrameTable
 from vslam.types.map import Map
+from vslam.types.states import PublishedState
+from vslam.types.track import Track
 
 
 class Mapper:
@@ -47,12 +48,13 @@ class Mapper:
         workers: Workers,
         map_: Map | None = None,
         frames: FrameTable | None = None,
+        state: PublishedState | None = None,
     ) -> None:
         """
         Args:
-            workers, map_, frames: see ``PublishedMap``.
+            workers, map_, frames, state: see ``PublishedMap``.
         """
-        self.published = PublishedMap(context, closing, workers, map_, frames)
+        self.published = PublishedMap(context, closing, workers, map_, frames, state)
         self._context = context
         self._closing = closing
 

@@ -7,8 +7,9 @@ from typing import Protocol
 
 import numpy as np
 
+from vslam.frontend.images import Images
 from vslam.frontend.keyframes import KeyframeEvidence, KeyframePolicy
-from vslam.frontend.track import By, Images, Prediction, Track
+from vslam.frontend.prediction import Prediction
 from vslam.frontend.tracker import Tracker
 from vslam.method.mapping import Mapper
 from vslam.method.published_map import PublishedMap
@@ -17,6 +18,7 @@ from vslam.types.camera import Image
 from vslam.types.context import Context
 from vslam.types.geometry import inverse, orthonormalised, se3_log
 from vslam.types.states import PolicyState
+from vslam.types.track import By, Track
 
 # A sub-map is rescaled so that the camera keeps the speed that it had before it was lost. It is
 # not rescaled if the factor would be larger than this number or smaller than its inverse. [own]
@@ -72,10 +74,6 @@ class Mode(Protocol):
         """Return the state for a checkpoint, or None if no checkpoint is possible now."""
         ...
 
-    def restore(self, state: PolicyState) -> None:
-        """Restore a state that the method ``state`` returned."""
-        ...
-
 
 class Localising:
     """Localises in the map and never changes it (``Mode``)."""
@@ -100,9 +98,6 @@ class Localising:
     def state(self) -> PolicyState | None:
         return None
 
-    def restore(self, state: PolicyState) -> None:
-        pass
-
 
 class Building:
     """Builds a map (``Mode``). Frames that see something new are inserted as keyframes.
@@ -114,10 +109,19 @@ class Building:
 
     changes_map = True
 
-    def __init__(self, context: Context, mapper: Mapper, tracker: Tracker) -> None:
+    def __init__(
+        self,
+        context: Context,
+        mapper: Mapper,
+        tracker: Tracker,
+        state: PolicyState | None = None,
+    ) -> None:
+        """
+        Args:
+            state: the state of the keyframe policy in a checkpoint; None at the start of a drive.
+        """
         self.starter = Starter(context)
-        self.policy = KeyframePolicy(context)
-        self._context = context
+        self.policy = KeyframePolicy(context, state)
         self._camera = context.camera
         self._config = context.config
         self._mapper = mapper
@@ -223,6 +227,3 @@ class Building:
 
     def state(self) -> PolicyState | None:
         return None if self.starter.is_waiting else self.policy.state
-
-    def restore(self, state: PolicyState) -> None:
-        self.policy = KeyframePolicy(self._context, state)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from vslam.frontend.motion_time import RECENT, motion_seconds
+from vslam.frontend.prediction import Prediction
 from vslam.frontend.standstill import has_come_to_rest, is_small
-from vslam.frontend.track import By, Prediction, Track
 from vslam.frontend.tracking import uncertainty_of
 from vslam.method.inertia import (
     CARRIED_S,
@@ -31,33 +31,35 @@ from vslam.types.geometry import (
     se3_exp,
     se3_log,
 )
-from vslam.types.imu import ImuCalibration, Inertia, InertialState
+from vslam.types.imu import ImuCalibration, Inertia
 from vslam.types.map_view import MapView
-from vslam.types.odometry import Odometry, OdometryState
-from vslam.types.states import Standstill
+from vslam.types.odometry import OdometryState, at_keyframe, moved
+from vslam.types.states import MotionState
+from vslam.types.track import By, Standstill, Track
 
 
 class Motion:
     """Predicts the pose of each frame, and follows the camera from frame to frame.
 
     Attributes:
-        odometry: the pose that drifts but never jumps, and its uncertainty.
-        lost_frames: number of frames that have been lost since the last one was tracked.
-        inertia: what is known from the IMU.
+        state: the odometry, the number of lost frames, and what is known from the IMU.
     """
 
     def __init__(
-        self, context: Context, frames: FramePoses, imu: ImuCalibration | None = None
+        self,
+        context: Context,
+        frames: FramePoses,
+        imu: ImuCalibration | None = None,
+        state: MotionState | None = None,
     ) -> None:
         """
         Args:
             frames: the recorded poses of all frames, including lost frames. They move with the map.
             imu: where the IMU is on the left camera as it is mounted, and its noise; None if there
                 is no IMU.
+            state: the state of a checkpoint; None at the start of a drive.
         """
-        self.odometry = Odometry()
-        self.lost_frames = 0
-        self.inertia = Inertia()
+        self.state = MotionState() if state is None else state
         self._imu = imu
         self._context = context
         self._frames = frames
@@ -85,9 +87,9 @@ class Motion:
                 T_cw = orthonormalised(se3_exp(twist * seconds) @ T_cw)
         inertial = None
         if self._imu is not None:
-            inertial = predicted_state(self.inertia, timestamp, self._imu)
+            inertial = predicted_state(self.state.inertia, timestamp, self._imu)
         if inertial is not None and self._imu is not None:
-            T_odom_camera = self.odometry.state.T_odom_camera
+            T_odom_camera = self.state.odometry.T_odom_camera
             T_now_last = self._as_tracked(predicted_motion(inertial, T_odom_camera, self._imu))
             T_cw = orthonormalised(T_now_last @ self._frames.pose(-1))
         return Prediction(
@@ -96,7 +98,7 @@ class Motion:
             T_cw,
             twist,
             last,
-            self.lost_frames,
+            self.state.lost_frames,
             self._is_resumed,
             seconds,
             times,
@@ -110,27 +112,28 @@ class Motion:
             The frame with its velocity. A relocalised frame has none, because the jump to its pose
             is not a motion of the camera.
         """
-        known = predicted.twist is not None
         if track.is_lost:
-            track = self._carried(track, predicted)
-            self._follow(track, track.T_cw, known_velocity=known, inertial=predicted.inertial)
-            self.lost_frames += track.state != TrackingState.DROPPED
+            inertia = self._carried(track, predicted)
+            if _is_carried(track, predicted, inertia):
+                track = replace(track, state=TrackingState.INERTIAL, by=By.INERTIA)
+            odometry = self._followed(track, track.T_cw, predicted)
+            n_lost = self.state.lost_frames + (track.state != TrackingState.DROPPED)
+            self.state = MotionState(odometry, n_lost, inertia)
             return track
         found_again = track.by is By.PLACE or not predicted.is_tracking
         track = self._with_velocity(track, predicted, view)
         covariance, of_offset = uncertainty_of(track, view.offset_sigma, self._context)
         T_moved = predicted.T_cw if found_again else track.T_cw
-        self._follow(
-            track, T_moved, covariance, of_offset, found_again=found_again, known_velocity=known,
-            inertial=predicted.inertial,
-        )  # fmt: skip
-        self._update_inertia(track, predicted, found_again=found_again)
-        self.lost_frames = 0
+        odometry = self._followed(
+            track, T_moved, predicted, covariance, of_offset, found_again=found_again
+        )
+        inertia = self._learned(track, predicted, odometry, found_again=found_again)
+        self.state = MotionState(odometry, 0, inertia)
         return track
 
     def add_samples(self, samples: Matrix) -> None:
         """Add samples of the IMU, see ``Slam.add_imu``."""
-        self.inertia = with_samples(self.inertia, samples)
+        self.state = replace(self.state, inertia=with_samples(self.state.inertia, samples))
 
     def gravity(self, T_wc: Matrix) -> Matrix | None:
         """Return the ``(3,)`` acceleration of free fall in the world frame of the map, in m/s^2.
@@ -138,36 +141,32 @@ class Motion:
         Args:
             T_wc: ``(4, 4)`` pose of the last frame in the map, of the camera as it is mounted.
         """
-        state = self.inertia.state
+        state = self.state.inertia.state
         if state is None:
             return None
-        R_odom_camera = self.odometry.state.T_odom_camera[:3, :3]
+        R_odom_camera = self.state.odometry.T_odom_camera[:3, :3]
         gravity: Matrix = T_wc[:3, :3] @ R_odom_camera.T @ state.gravity
         return gravity
 
-    def _carried(self, track: Track, predicted: Prediction) -> Track:
-        """Follow the IMU to a frame that was not tracked. Return the frame with its state."""
+    def _carried(self, track: Track, predicted: Prediction) -> Inertia:
+        """Return what is known from the IMU after a frame that was not tracked."""
+        inertia = self.state.inertia
         if self._imu is None or not len(self._frames):
-            return track
-        elapsed = track.timestamp - self._frames.timestamp(-1)
-        self.inertia = lost(self.inertia, predicted.inertial, elapsed)
-        if predicted.inertial is None or self.inertia.carried_s > CARRIED_S:
-            return track
-        if track.state != TrackingState.LOST:
-            return track
-        return replace(track, state=TrackingState.INERTIAL, by=By.INERTIA)
+            return inertia
+        return lost(inertia, predicted.inertial, track.timestamp - self._frames.timestamp(-1))
 
-    def _update_inertia(self, track: Track, predicted: Prediction, *, found_again: bool) -> None:
-        """Learn from a tracked frame, to which the odometry has moved."""
+    def _learned(
+        self, track: Track, predicted: Prediction, odometry: OdometryState, *, found_again: bool
+    ) -> Inertia:
+        """Return what is known from the IMU after a tracked frame, to which the odometry moved."""
+        inertia, inertial = self.state.inertia, predicted.inertial
         if self._imu is None:
-            return
-        odometry, inertial = self.odometry.state, predicted.inertial
+            return inertia
         T_odom_camera, local = odometry.T_odom_camera, odometry.now.local
         if found_again:
-            self.inertia = anew(self.inertia, inertial, T_odom_camera, self._imu)
-            return
-        self.inertia = tracked(
-            self.inertia, inertial, track.timestamp, T_odom_camera, local, self._imu,
+            return anew(inertia, inertial, T_odom_camera, self._imu)
+        return tracked(
+            inertia, inertial, track.timestamp, T_odom_camera, local, self._imu,
             stands_still=track.by is By.STANDSTILL,
         )  # fmt: skip
 
@@ -182,8 +181,7 @@ class Motion:
 
     def keyframe(self) -> None:
         """Note that the last frame became a keyframe."""
-        self.odometry.keyframe()
-        self.lost_frames = 0
+        self.state = replace(self.state, odometry=at_keyframe(self.state.odometry), lost_frames=0)
 
     def resume(self, twist: Matrix | None = None) -> None:
         """Continue a drive whose last frame is not available.
@@ -196,11 +194,8 @@ class Motion:
     def resume_odometry(self, last: TrackResult) -> None:
         """Continue the odometry after the last frame of a drive, whose state was not saved."""
         if last.T_odom_camera is not None and last.uncertainty is not None:
-            self.odometry = Odometry(OdometryState(last.T_odom_camera, last.uncertainty, 0.0))
-
-    def restore(self, odometry: OdometryState, lost_frames: int, inertia: Inertia) -> None:
-        """Restore the state of a checkpoint."""
-        self.odometry, self.lost_frames, self.inertia = Odometry(odometry), lost_frames, inertia
+            odometry = OdometryState(last.T_odom_camera, last.uncertainty, 0.0)
+            self.state = replace(self.state, odometry=odometry)
 
     def _with_velocity(self, track: Track, predicted: Prediction, view: MapView) -> Track:
         """Return a tracked frame with its velocity since the last tracked frame, and with the place
@@ -238,25 +233,23 @@ class Motion:
         xy = track.features.xy[now]
         return Standstill(track.T_cw, track.landmark[now], xy, view.n_keyframes)
 
-    def _follow(
+    def _followed(
         self,
         track: Track,
         T_cw: Matrix,
+        predicted: Prediction,
         covariance: Matrix | None = None,
         of_offset: Matrix | None = None,
         *,
         found_again: bool = False,
-        known_velocity: bool,
-        inertial: InertialState | None = None,
-    ) -> None:
-        """Move the odometry.
+    ) -> OdometryState:
+        """Return the odometry at a frame.
 
         Args:
             T_cw: ``(4, 4)`` pose of the frame, computed from the continuous motion since the last
                 frame. It differs from the pose of the frame in the map if the camera was
                 relocalised.
-            covariance, of_offset, found_again, known_velocity: see ``Odometry.move``.
-            inertial: the state of the IMU from which the pose was predicted, if it was.
+            covariance, of_offset, found_again: see ``vslam.types.odometry.moved``.
         """
         frames, camera = self._frames, self._context.camera
         T_now_last, elapsed = np.eye(4), 0.0
@@ -270,9 +263,21 @@ class Motion:
             covariance = None if covariance is None else A @ covariance @ A.T
             of_offset = None if of_offset is None else A @ of_offset @ R.T
         carried, is_predicted = None, covariance is None or found_again
-        if is_predicted and inertial is not None and self._imu is not None:
-            carried = predicted_covariance(inertial, self._imu)
-        self.odometry.move(
-            T_now_last, elapsed, covariance, of_offset,
-            found_again=found_again, known_velocity=known_velocity, carried=carried,
-        )  # fmt: skip
+        if is_predicted and predicted.inertial is not None and self._imu is not None:
+            carried = predicted_covariance(predicted.inertial, self._imu)
+        return moved(
+            self.state.odometry,
+            T_now_last,
+            elapsed,
+            covariance,
+            of_offset,
+            found_again=found_again,
+            known_velocity=predicted.twist is not None,
+            carried=carried,
+        )
+
+
+def _is_carried(track: Track, predicted: Prediction, inertia: Inertia) -> bool:
+    """Return whether the IMU measured the pose of a frame that was not tracked."""
+    measured = predicted.inertial is not None and inertia.carried_s <= CARRIED_S
+    return measured and track.state == TrackingState.LOST

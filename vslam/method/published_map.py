@@ -19,7 +19,6 @@ import numpy as np
 
 from vslam.backend.disparity_offset import offset_sigma
 from vslam.frontend.patches import RecentPatches, patches_of_frame, patches_of_landmarks
-from vslam.frontend.track import Track
 from vslam.method.closing import LoopClosing, LoopSearch
 from vslam.method.hypotheses import part_of
 from vslam.method.map_frames import LandmarkCounts, MapChange, count_shared_landmarks
@@ -31,7 +30,8 @@ from vslam.types.frame_poses import FramePoses, FrameTable
 from vslam.types.geometry import Matrix, inverse
 from vslam.types.map import Map
 from vslam.types.map_view import MapView, local_map, view_of
-from vslam.types.states import MapperState
+from vslam.types.states import PublishedState
+from vslam.types.track import Track
 from vslam.types.trajectory import Trajectory
 
 # A loop that was found is closed this many frames after its keyframe, or at the next keyframe.
@@ -57,6 +57,7 @@ class PublishedMap:
         workers: Workers,
         map_: Map | None = None,
         frames: FrameTable | None = None,
+        state: PublishedState | None = None,
     ) -> None:
         """Begin a new map, or continue a map.
 
@@ -64,6 +65,7 @@ class PublishedMap:
             workers: threads that run mapping jobs, one at a time, and searches for loops.
             map_: map to continue in. None begins an empty map.
             frames: poses of earlier frames of the same drive.
+            state: the state that was saved together with the map; None without a checkpoint.
         """
         self.view = MapView(T_reference=inverse(context.camera.T_mounted_camera))
         self.last_frame = -1
@@ -78,8 +80,14 @@ class PublishedMap:
         self._search: Job[LoopSearch] | None = None
         self._counts = LandmarkCounts()
         self.frames = FramePoses(self, frames)
-        if self.map.n_keyframes:
-            self.refer_to(int(self.map.living_keyframes()[-1]))
+        if state is None and self.map.n_keyframes:
+            state = _state_at(int(self.map.living_keyframes()[-1]), self.map, self.frames)
+        if state is not None:
+            self.last_frame, self.last_timestamp = state.last_frame, state.last_timestamp
+            for patches in state.patches:
+                self._patches.add(patches)
+            self._known_place = state.known_place
+            self.refer_to(state.reference)
 
     # What may be read at any time
 
@@ -260,11 +268,9 @@ class PublishedMap:
         if shared[best] and best != self.reference:
             self.refer_to(best)
 
-    # State for checkpoints
-
-    def state(self) -> MapperState:
+    def state(self) -> PublishedState:
         """Return the state for a checkpoint, without the map."""
-        return MapperState(
+        return PublishedState(
             self.reference,
             self.last_frame,
             self.last_timestamp,
@@ -272,17 +278,12 @@ class PublishedMap:
             self._known_place,
         )
 
-    def restore(self, state: MapperState) -> None:
-        """Restore a state, given the map that was saved together with it."""
-        self.last_frame, self.last_timestamp = state.last_frame, state.last_timestamp
-        for patches in state.patches:
-            self._patches.add(patches)
-        self._known_place = state.known_place
-        self.refer_to(state.reference)
 
-    def continue_drive(self) -> None:
-        """If the reference keyframe belongs to this drive, treat it as the last inserted one."""
-        map_, newest = self.map, self.reference
-        if map_.n_keyframes and map_.sessions[newest] == map_.scalars.session:
-            self.last_frame = int(map_.frames[newest])
-            self.last_timestamp = float(map_.timestamps[newest])
+def _state_at(keyframe: int, map_: Map, frames: FramePoses) -> PublishedState:
+    """Return the state with which a map is continued at a keyframe.
+
+    If the drive itself continues, the keyframe counts as the last that was inserted.
+    """
+    if not len(frames) or map_.sessions[keyframe] != map_.scalars.session:
+        return PublishedState(keyframe)
+    return PublishedState(keyframe, int(map_.frames[keyframe]), float(map_.timestamps[keyframe]))

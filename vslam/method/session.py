@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vslam.config import changed_thresholds
+from vslam.frontend.images import Images
 from vslam.frontend.orb import level_shapes
-from vslam.frontend.pose_alignment import coarse_pyramid, coarse_shapes
+from vslam.frontend.pose_alignment import is_coarse
+from vslam.frontend.prediction import Prediction
 from vslam.frontend.relocaliser import Relocaliser
 from vslam.frontend.rig import RigMonitor
-from vslam.frontend.track import By, Images, Prediction, Track
 from vslam.frontend.tracker import Tracker
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.learned_verification import LearnedRelocalisation
@@ -30,12 +31,13 @@ from vslam.support.machine import StageClock
 from vslam.support.workers import Workers
 from vslam.types.camera import same_camera
 from vslam.types.context import Context
-from vslam.types.features import Extracted, TrackingState, TrackResult
+from vslam.types.features import TrackingState, TrackResult
 from vslam.types.frame_poses import FrameTable
 from vslam.types.geometry import Matrix, inverse, orthonormalised, se3_log
 from vslam.types.imu import ImuCalibration
 from vslam.types.map import Map
-from vslam.types.states import Checkpoint, TrackerState
+from vslam.types.states import Checkpoint, ClosingState
+from vslam.types.track import By, Track
 
 _log = logging.getLogger(__name__)
 
@@ -93,6 +95,11 @@ def open_map(
         )
     if not same_camera(stored.camera, context.camera):
         raise ValueError("made with another camera")
+    checkpoint = stored.checkpoint if resume else None
+    if checkpoint is not None and (coarse := checkpoint.last.coarse) is not None:
+        size = context.camera.height, context.camera.width
+        if not is_coarse(coarse, level_shapes(size, context.config.orb), size):
+            raise ValueError("the last frame is damaged")
     closing.detector.restore(stored.detector)
     if images is not None and stored.images is not None:
         images.restore(stored.images, context.camera.width)
@@ -100,7 +107,7 @@ def open_map(
     drives = stored.drives if map_.n_keyframes else ()
     alignment = stored.truth_alignment
     if resume:
-        return OpenedMap(map_, stored.frames, stored.checkpoint, drives[:-1], alignment)
+        return OpenedMap(map_, stored.frames, checkpoint, drives[:-1], alignment)
     if map_.n_keyframes and not localize:
         map_.begin_drive()
     return OpenedMap(map_, drives=drives, truth_alignment=alignment)
@@ -141,27 +148,29 @@ class Session:
         Raises:
             ValueError: the map cannot be continued. The message gives the reason in a few words.
         """
-        checkpoint = start.checkpoint if start is not None and resume else None
-        state = None if checkpoint is None else checkpoint.closing
-        verifier = Verifier(context, images, None if state is None else state.verifier)
+        state = start.checkpoint if start is not None and resume else None
+        of_closing = state.closing if state else ClosingState()
+        verifier = Verifier(context, images, of_closing.verifier)
         self.closing = closing = LoopClosing(
-            detector, verifier, context, threads=workers.threads, state=state
+            detector, verifier, context, threads=workers.threads, state=of_closing
         )
         self.opened = opened = open_map(start, context, closing, localize=localize, resume=resume)
-        self._mapper = mapper = Mapper(context, closing, workers, opened.map, opened.frames)
-        self.published = mapper.published
-        self.rig = RigMonitor()
-        self.last: Track | None = None
+        self._mapper = mapper = Mapper(
+            context, closing, workers, opened.map, opened.frames, state.published if state else None
+        )
+        self.published = published = mapper.published
+        self.rig = RigMonitor(state.sides if state else None)
+        self.last: Track | None = state.last if state else None
         self._context = context
         recognise = LearnedRelocalisation(images, context)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)
-        self._motion = Motion(context, self.published.frames, imu)
+        self._motion = Motion(context, published.frames, imu, state.motion if state else None)
         self._tracker = tracker = Tracker(context)
-        self._mode: Mode = (
-            Localising(self.published) if localize else Building(context, mapper, tracker)
-        )
-        if opened.frames is not None:
-            self._resume(opened.frames)
+        self._mode: Mode = Localising(published)
+        if not localize:
+            self._mode = Building(context, mapper, tracker, state.policy if state else None)
+        if state is None and opened.frames is not None and len(opened.frames.timestamp):
+            self._continue_from_poses(opened.frames)
 
     def step(
         self,
@@ -184,7 +193,7 @@ class Session:
         updated = self._mode.update_map(track, images, predicted)
         # If patches failed for this frame, they will probably fail for the next frames.
         soon = self._mode.due if track.by_patches else track.index + 2
-        return self._end(updated, images, clock, soon)
+        return self._end(updated, clock, soon)
 
     def add_imu(self, samples: Matrix) -> None:
         """Add samples of the IMU (``Slam.add_imu``)."""
@@ -193,7 +202,7 @@ class Session:
     @property
     def inertia(self) -> Inertia:
         """What is known from the IMU."""
-        return self._motion.inertia
+        return self._motion.state.inertia
 
     def skip(self, timestamp: float, *, dropped: bool) -> TrackResult:
         """Add a frame without images at the predicted pose. Its state is LOST or DROPPED."""
@@ -239,7 +248,7 @@ class Session:
         state = TrackingState.OK if track.is_keyframe else TrackingState.LOST
         track = replace(track, state=state, n_matches=n, n_inliers=n)
         on_pose(self._result(track, dict(clock.ms)))
-        return self._end(track, images, clock)
+        return self._end(track, clock)
 
     def _track(
         self, images: Images, predicted: Prediction, clock: StageClock
@@ -275,20 +284,18 @@ class Session:
         self.last = predicted.last if track.is_lost else track
         return track
 
-    def _end(
-        self, track: Track, images: Images, clock: StageClock, next_extraction: int = -1
-    ) -> TrackResult:
+    def _end(self, track: Track, clock: StageClock, next_extraction: int = -1) -> TrackResult:
         """End the step of a frame, which may have become a keyframe."""
         if track.is_keyframe:
             self._motion.keyframe()
         if track.is_keyframe or not track.is_lost:
             self.last = track
-        self.rig.observe(track, images)
+        self.rig.observe(track)
         clock.lap("keyframe")
         return replace(self._result(track, clock.ms), next_extraction=next_extraction)
 
     def _result(self, track: Track, stage_ms: dict[str, float]) -> TrackResult:
-        odometry = self._motion.odometry.state
+        odometry = self._motion.state.odometry
         T_wc = self._context.camera.as_mounted(inverse(track.T_cw))
         return TrackResult(
             index=track.index,
@@ -348,13 +355,12 @@ class Session:
         if self.closing.is_adjusting or not published.is_complete:
             return None
         return Checkpoint(
-            tracker_state(self.last, self._motion.lost_frames),
+            self.last,
+            self._motion.state,
             published.state(),
             policy,
             self.closing.state(),
             self.rig.sides,
-            self._motion.odometry.state,
-            self._motion.inertia,
         )
 
     def resume_odometry(self, last: TrackResult) -> None:
@@ -362,13 +368,9 @@ class Session:
         if self.opened.checkpoint is None:
             self._motion.resume_odometry(last)
 
-    def _resume(self, frames: FrameTable) -> None:
-        if len(frames.timestamp):
-            self.published.continue_drive()
-            self._motion.resume()
-        if self.opened.checkpoint is not None:
-            self._restore(self.opened.checkpoint)
-            return
+    def _continue_from_poses(self, frames: FrameTable) -> None:
+        """Continue a drive from the poses of its frames, without a checkpoint."""
+        self._motion.resume()
         if self.published.n_keyframes:
             _log.warning(
                 "the map was saved without the state of tracking (resumable=True), so the poses of "
@@ -379,52 +381,3 @@ class Session:
             poses = self.published.frames
             step = se3_log(orthonormalised(poses.pose(-1) @ inverse(poses.pose(-2))))
             self._motion.resume(step / (frames.timestamp[-1] - frames.timestamp[-2]))
-
-    def _restore(self, state: Checkpoint) -> None:
-        """Restore the state of all parts, given the map that was stored together with it."""
-        self.published.restore(state.mapper)
-        self._mode.restore(state.policy)
-        self.rig = RigMonitor(state.sides)
-        self._motion.restore(state.odometry, state.tracker.lost_frames, state.inertia)
-        last = restored_track(state.tracker, self._context)
-        offset = self.published.view.disparity_offset  # it was corrected before it was saved
-        extracted = replace(last.extracted, disparity_offset=offset)
-        positions = self.published.map.arrays.xyz[last.landmark]
-        xyz = np.where((last.landmark >= 0)[:, None], positions, np.nan)
-        self.last = replace(last, extracted=extracted, xyz=xyz)
-
-
-def tracker_state(last: Track, lost_frames: int) -> TrackerState:
-    """Return the last tracked frame for a checkpoint."""
-    return TrackerState(
-        index=last.index,
-        timestamp=last.timestamp,
-        features=last.features,
-        landmark=last.landmark,
-        T_cw=last.T_cw,
-        twist=last.twist,
-        lost_frames=lost_frames,
-        n_tracked=last.n_inliers,
-        coarse=np.empty(0, np.uint8) if last.coarse is None else last.coarse.pixels,
-        standstill=last.still,
-    )
-
-
-def restored_track(state: TrackerState, context: Context) -> Track:
-    """Return the frame whose state ``tracker_state`` returned, without positions of landmarks."""
-    coarse = None
-    if len(state.coarse):
-        size = context.camera.height, context.camera.width
-        shapes = coarse_shapes(level_shapes(size, context.config.orb))
-        coarse = coarse_pyramid(state.coarse, shapes, size)
-    return Track(
-        state.index,
-        state.timestamp,
-        state.T_cw,
-        Extracted(state.features),
-        state.landmark,
-        n_inliers=state.n_tracked,
-        twist=state.twist,
-        still=state.standstill,
-        coarse=coarse,
-    )

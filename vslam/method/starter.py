@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from vslam.backend.two_views import adjust_two_views
 from vslam.frontend.initialization import match_views, reconstruct
-from vslam.frontend.track import Track
 from vslam.types.camera import Image
 from vslam.types.context import Context
 from vslam.types.geometry import Matrix, se3_log
+from vslam.types.track import Track
 
 
 @dataclass(frozen=True)

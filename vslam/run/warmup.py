@@ -56,7 +56,6 @@ from vslam.frontend import pnp
 from vslam.frontend.depth import columns_of_depth
 from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
 from vslam.frontend.relocaliser import relocalised
-from vslam.frontend.track import Track
 from vslam.loopclosure import bow, local_matching, sim3_ransac
 from vslam.loopclosure.bow import BowDetector
 from vslam.loopclosure.detector import NoDetector
@@ -75,6 +74,7 @@ from vslam.types.features import Extracted, Features, TrackingState
 from vslam.types.loops import LoopCandidate, LoopEdge
 from vslam.types.map import Map
 from vslam.types.map_view import local_map
+from vslam.types.track import Track
 
 WIDTH, HEIGHT, DISPARITY, STEP, FRAMES = 480, 240, 12, 6, 6
 CAMERA = Camera(240.0, 240.0, WIDTH / 2, HEIGHT / 2, 0.5, WIDTH, HEIGHT)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,6 +102,21 @@ Keypoints = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
+class Sides:
+    """The difference in exposure between the left and the right image of a stereo pair.
+
+    Attributes:
+        darker_stops: difference in exposure, in stops; positive if the right image is darker. It is
+            0 if the difference is below the threshold, or if a common gain does not explain the
+            difference.
+        black: the side whose image is black while the other image is not; empty if there is none.
+    """
+
+    darker_stops: float = 0.0
+    black: Literal["", "left", "right"] = ""
+
+
+@dataclass(frozen=True)
 class Extracted:
     """The result of feature extraction for one frame.
 
@@ -111,11 +126,16 @@ class Extracted:
             sub-pixel accuracy.
         disparity_offset: offset that has been added to every disparity, in pixels
             (``vslam.frontend.rig.with_offset``).
+        sides: result of comparing the exposure of the left and the right image. None if there is no
+            right image, or if none was read.
+        problem: why the second image could not be read. None if there was no such problem.
     """
 
     features: Features
     pyramid: Pyramid | None = None
     disparity_offset: float = 0.0
+    sides: Sides | None = None
+    problem: str | None = None
 
     @classmethod
     def nothing(cls) -> Extracted:

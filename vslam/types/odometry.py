@@ -191,76 +191,66 @@ class OdometryState:
     lost_s: float = -1.0
 
 
-class Odometry:
-    """Follows the motion of the camera from frame to frame, and the uncertainty of its pose.
+def moved(
+    state: OdometryState,
+    T_now_last: Matrix,
+    elapsed: float,
+    covariance: Matrix | None,
+    of_offset: Matrix | None = None,
+    *,
+    found_again: bool = False,
+    known_velocity: bool = True,
+    carried: Matrix | None = None,
+) -> OdometryState:
+    """Advance to the next frame.
 
-    Attributes:
-        state: the pose of the last frame and its uncertainty.
+    Args:
+        T_now_last: ``(4, 4)`` motion, which maps points from the camera of the last frame to the
+            camera of the next frame.
+        elapsed: seconds between the two frames.
+        covariance: ``(6, 6)`` covariance of the optimised pose (``pose_covariance``). None if the
+            pose was only predicted with constant velocity. The error of a predicted pose grows with
+            the square of the time since tracking was lost.
+        of_offset: ``(6, 3)`` error of the motion per unit of its translation, if the disparity
+            offset is wrong by one standard deviation (``offset_effect``). None if the offset has no
+            effect.
+        found_again: whether ``T_now_last`` was predicted although the frame was tracked, because
+            the camera was lost before or was relocalised.
+        known_velocity: whether the velocity before the prediction was known. Otherwise, the
+            prediction is that the camera does not move.
+        carried: ``(6, 6)`` covariance of the pose since tracking was lost, if an IMU predicted it.
+            None if the pose was predicted with constant velocity.
     """
+    T_odom_camera = orthonormalised(state.T_odom_camera @ inverse(T_now_last))
+    A, now, lost_s = adjoint(T_now_last), state.now, state.lost_s
+    local, gaps = now.local, _symmetric(A @ now.gaps @ A.T)
+    if covariance is not None and not np.isfinite(covariance).all():
+        covariance = None
+    if state.lost_s >= 0.0 and (found_again or covariance is None):
+        lost_s += elapsed
+        speed = 0.0 if known_velocity else ANY_SPEED
+        local = _predicted(local, A, state.lost_s, lost_s, speed) if carried is None else carried
+    if state.lost_s >= 0.0 and found_again:
+        gaps, local = gaps + local, np.zeros((6, 6))
+    if covariance is not None:
+        local, lost_s = _symmetric(covariance), 0.0
+    offset = A @ now.offset
+    if of_offset is not None and np.isfinite(of_offset).all():
+        offset += of_offset @ T_now_last[:3, 3]
+    drift = _symmetric(A @ now.drift @ A.T)
+    now = PoseUncertainty(local, drift, now.n_keyframes, offset, gaps)
+    return OdometryState(T_odom_camera, now, lost_s)
 
-    def __init__(self, state: OdometryState | None = None) -> None:
-        self.state = OdometryState() if state is None else state
 
-    def move(
-        self,
-        T_now_last: Matrix,
-        elapsed: float,
-        covariance: Matrix | None,
-        of_offset: Matrix | None = None,
-        *,
-        found_again: bool = False,
-        known_velocity: bool = True,
-        carried: Matrix | None = None,
-    ) -> None:
-        """Advance to the next frame.
+def at_keyframe(state: OdometryState) -> OdometryState:
+    """Return the state after the last frame became a keyframe.
 
-        Args:
-            T_now_last: ``(4, 4)`` motion, which maps points from the camera of the last frame to
-                the camera of the next frame.
-            elapsed: seconds between the two frames.
-            covariance: ``(6, 6)`` covariance of the optimised pose (``pose_covariance``). None if
-                the pose was only predicted with constant velocity. The error of a predicted pose
-                grows with the square of the time since tracking was lost.
-            of_offset: ``(6, 3)`` error of the motion per unit of its translation, if the disparity
-                offset is wrong by one standard deviation (``offset_effect``). None if the offset
-                has no effect.
-            found_again: whether ``T_now_last`` was predicted although the frame was tracked,
-                because the camera was lost before or was relocalised.
-            known_velocity: whether the velocity before the prediction was known. Otherwise, the
-                prediction is that the camera does not move.
-            carried: ``(6, 6)`` covariance of the pose since tracking was lost, if an IMU predicted
-                it. None if the pose was predicted with constant velocity.
-        """
-        T_odom_camera = orthonormalised(self.state.T_odom_camera @ inverse(T_now_last))
-        A, now, before = adjoint(T_now_last), self.state.now, self.state.lost_s
-        lost_s = before
-        local, gaps = now.local, _symmetric(A @ now.gaps @ A.T)
-        if covariance is not None and not np.isfinite(covariance).all():
-            covariance = None
-        if before >= 0.0 and (found_again or covariance is None):
-            lost_s += elapsed
-            speed = 0.0 if known_velocity else ANY_SPEED
-            local = _predicted(local, A, before, lost_s, speed) if carried is None else carried
-        if before >= 0.0 and found_again:
-            gaps, local = gaps + local, np.zeros((6, 6))
-        if covariance is not None:
-            local, lost_s = _symmetric(covariance), 0.0
-        offset = A @ now.offset
-        if of_offset is not None and np.isfinite(of_offset).all():
-            offset += of_offset @ T_now_last[:3, 3]
-        drift = _symmetric(A @ now.drift @ A.T)
-        now = PoseUncertainty(local, drift, now.n_keyframes, offset, gaps)
-        self.state = OdometryState(T_odom_camera, now, lost_s)
-
-    def keyframe(self) -> None:
-        """Record that the last frame became a keyframe.
-
-        The error of the frame is added to the drift, because new landmarks inherit it. If the pose
-        of the frame was predicted, the keyframe begins a sub-map, and the error is that of a gap.
-        """
-        now = replace(self.state.now, n_keyframes=self.state.now.n_keyframes + 1)
-        if self.state.lost_s == 0.0:
-            now = replace(now, drift=now.drift + now.local)
-        else:
-            now = replace(now, local=np.zeros((6, 6)), gaps=now.gaps + now.local)
-        self.state = replace(self.state, now=now, lost_s=0.0)
+    The error of the frame is added to the drift, because new landmarks inherit it. If the pose of
+    the frame was predicted, the keyframe begins a sub-map, and the error is that of a gap.
+    """
+    now = replace(state.now, n_keyframes=state.now.n_keyframes + 1)
+    if state.lost_s == 0.0:
+        now = replace(now, drift=now.drift + now.local)
+    else:
+        now = replace(now, local=np.zeros((6, 6)), gaps=now.gaps + now.local)
+    return replace(state, now=now, lost_s=0.0)

@@ -6,84 +6,34 @@ the results of an uninterrupted run.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
-from vslam.types.features import Features, FramePatches, KeyframePatches
-from vslam.types.geometry import Matrix
+from vslam.types.features import FramePatches, KeyframePatches
 from vslam.types.imu import Inertia
 from vslam.types.loops import LoopEdge, ResembledPlace
 from vslam.types.odometry import OdometryState
+from vslam.types.track import Track
 
 
 @dataclass(frozen=True)
-class Standstill:
-    """Where N landmarks were in the image when the camera came to rest.
+class MotionState:
+    """State of the motion of the camera.
 
     Attributes:
-        T_cw: ``(4, 4)`` pose of the camera (world to camera).
-        ids: ``(N,)`` int32 ids of the landmarks, sorted.
-        xy: ``(N, 2)`` float32 positions in pixels.
-        n_keyframes: number of keyframes of the map at that time. A new keyframe may change the ids.
+        odometry: the pose that drifts but never jumps, and its uncertainty.
+        lost_frames: number of frames that have been lost since the last one was tracked.
+        inertia: what is known from the IMU.
     """
 
-    T_cw: Matrix
-    ids: NDArray[np.int32]
-    xy: NDArray[np.float32]
-    n_keyframes: int
-
-    def flow(
-        self, ids: NDArray[np.int32], xy: NDArray[np.float32]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-        """Compute how far landmarks have moved in the image.
-
-        Args:
-            ids, xy: ``(M,)`` landmarks, and ``(M, 2)`` positions in pixels where they are seen now.
-
-        Returns:
-            ``(M,)`` bool, whether a landmark was seen when the camera came to rest, and ``(M, 2)``
-            pixels. The motion of a landmark that was not seen then has no meaning.
-        """
-        if not len(self.ids):
-            return np.zeros(len(ids), np.bool_), np.zeros((len(ids), 2), np.float32)
-        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
-        return self.ids[at] == ids, xy - self.xy[at]
+    odometry: OdometryState = field(default_factory=OdometryState)
+    lost_frames: int = 0
+    inertia: Inertia = field(default_factory=Inertia)
 
 
 @dataclass(frozen=True)
-class TrackerState:
-    """State of the tracker.
-
-    Attributes:
-        index, timestamp: index and time (seconds) of the last tracked frame.
-        features: the N features of this frame.
-        landmark: ``(N,)`` int32, the landmark that each feature observes, or -1.
-        T_cw: ``(4, 4)`` pose of this frame.
-        twist: ``(6,)`` twist of the camera per second at this frame. None if it is unknown.
-        lost_frames: number of lost frames since this frame.
-        n_tracked: number of landmarks that the frame tracked.
-        coarse: ``(Q,)`` uint8 pixels of the small images of the frame (``coarse_levels``). The
-            array is empty if the frame has no such images.
-        standstill: what the camera saw when it came to rest. None if the camera moves.
-    """
-
-    index: int
-    timestamp: float
-    features: Features
-    landmark: NDArray[np.int32]
-    T_cw: Matrix
-    twist: Matrix | None
-    lost_frames: int
-    n_tracked: int
-    coarse: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
-    standstill: Standstill | None = None
-
-
-@dataclass(frozen=True)
-class MapperState:
-    """State of the mapper.
+class PublishedState:
+    """State of the published map, apart from the map.
 
     Attributes:
         reference: the keyframe that frames are tracked against. The poses of frames are relative to
@@ -96,9 +46,9 @@ class MapperState:
     """
 
     reference: int
-    last_frame: int
-    last_timestamp: float
-    patches: tuple[KeyframePatches, ...]
+    last_frame: int = -1
+    last_timestamp: float = -math.inf
+    patches: tuple[KeyframePatches, ...] = ()
     known_place: FramePatches | None = None
 
 
@@ -190,12 +140,17 @@ class ComparedSides:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The states of all parts of SLAM between two frames."""
+    """The states of all parts of SLAM between two frames.
 
-    tracker: TrackerState
-    mapper: MapperState
+    Attributes:
+        last: the last frame that was tracked.
+        motion, published, policy, closing: the state of each part.
+        sides: a summary of the differences in exposure of the stereo pairs.
+    """
+
+    last: Track
+    motion: MotionState
+    published: PublishedState
     policy: PolicyState
-    closing: ClosingState
+    closing: ClosingState = field(default_factory=ClosingState)
     sides: ComparedSides = field(default_factory=ComparedSides)
-    odometry: OdometryState = field(default_factory=OdometryState)
-    inertia: Inertia = field(default_factory=Inertia)

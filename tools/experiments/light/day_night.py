@@ -29,12 +29,12 @@ from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import parse_perturbation
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.relocaliser import Relocaliser
-from vslam.frontend.track import Track
 from vslam.loopclosure.learned_verification import LearnedRelocalisation
 from vslam.loopclosure.registry import detector_with_images
 from vslam.slam import Slam
 from vslam.types.camera import Image
 from vslam.types.geometry import Matrix, inverse
+from vslam.types.track import Track
 
 WITHIN_M, WITHIN_DEG = 2.0, 15.0
 LAWS = ("none", "dark:4", "dark:8", "dark:10", "dark:12", "brightness:1.5")

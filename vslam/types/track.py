@@ -1,74 +1,15 @@
-"""What is known about a frame: before its images are tracked, and afterwards."""
+"""A frame that was tracked or is lost."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.frontend.masks import Mask
-from vslam.frontend.motion_time import motion_seconds
-from vslam.frontend.sides import Sides
-from vslam.types.camera import Image
-from vslam.types.features import Extracted, Features, Keypoints, Pyramid, TrackingState
+from vslam.types.features import Extracted, Features, Pyramid, TrackingState
 from vslam.types.geometry import Matrix
-from vslam.types.imu import InertialState
-from vslam.types.loops import LastSeen
-from vslam.types.map_view import MapView
-from vslam.types.states import Standstill
-
-
-class Images(Protocol):
-    """The images of a frame, whose features are extracted when they are first needed.
-
-    Attributes:
-        pyramid: the pyramid of the left image. None if frames are not tracked by patches.
-        coarse: the small images of the frame (``coarse_levels``). None if ``pyramid`` is None.
-        mask: the mask of the left image. None if all pixels are used.
-        sides: result of comparing the exposure of the left and the right image. None if there is no
-            right image, or if it has not been read.
-        problem: why the second image could not be read. None if there was no such problem.
-    """
-
-    pyramid: Pyramid | None
-    coarse: Pyramid | None
-    mask: Mask | None
-    sides: Sides | None
-    problem: str | None
-
-    @property
-    def extracted(self) -> Extracted:
-        """The features of the frame."""
-        ...
-
-    def extracted_with(self, keypoints: Keypoints) -> Extracted:
-        """Return the features of the frame, and additional features at the given positions and
-        pyramid levels of the left image."""
-        ...
-
-    @property
-    def image(self) -> Image | None:
-        """The ``(H, W)`` uint8 left image for loop detectors. None if it is not available."""
-        ...
-
-
-@dataclass
-class GivenFeatures:
-    """The images of a frame whose features were extracted in advance (``Images``)."""
-
-    extracted: Extracted
-    image: Image | None = None
-    pyramid: Pyramid | None = None
-    coarse: Pyramid | None = None
-    mask: Mask | None = None
-    sides: Sides | None = None
-    problem: str | None = None
-
-    def extracted_with(self, keypoints: Keypoints) -> Extracted:
-        return self.extracted
 
 
 class By(StrEnum):
@@ -86,6 +27,40 @@ class By(StrEnum):
     """Features were matched near a predicted pose, or with the reference keyframe."""
     PLACE = "place"
     """The frame was relocalised: a similar keyframe was found in the whole map."""
+
+
+@dataclass(frozen=True)
+class Standstill:
+    """Where N landmarks were in the image when the camera came to rest.
+
+    Attributes:
+        T_cw: ``(4, 4)`` pose of the camera (world to camera).
+        ids: ``(N,)`` int32 ids of the landmarks, sorted.
+        xy: ``(N, 2)`` float32 positions in pixels.
+        n_keyframes: number of keyframes of the map at that time. A new keyframe may change the ids.
+    """
+
+    T_cw: Matrix
+    ids: NDArray[np.int32]
+    xy: NDArray[np.float32]
+    n_keyframes: int
+
+    def flow(
+        self, ids: NDArray[np.int32], xy: NDArray[np.float32]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Compute how far landmarks have moved in the image.
+
+        Args:
+            ids, xy: ``(M,)`` landmarks, and ``(M, 2)`` positions in pixels where they are seen now.
+
+        Returns:
+            ``(M,)`` bool, whether a landmark was seen when the camera came to rest, and ``(M, 2)``
+            pixels. The motion of a landmark that was not seen then has no meaning.
+        """
+        if not len(self.ids):
+            return np.zeros(len(ids), np.bool_), np.zeros((len(ids), 2), np.float32)
+        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        return self.ids[at] == ids, xy - self.xy[at]
 
 
 def _no_ids() -> NDArray[np.int32]:
@@ -210,61 +185,3 @@ class Track:
         landmark, xyz = self.landmark.copy(), self.xyz.copy()
         landmark[features], xyz[features] = -1, np.nan
         return replace(self, landmark=landmark, xyz=xyz)
-
-
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """What is known about a frame before its images are tracked.
-
-    Attributes:
-        index, timestamp: of the frame.
-        T_cw: ``(4, 4)`` predicted pose (world to camera).
-        twist: ``(6,)`` velocity with which the pose was predicted, see ``Track.twist``; None if it
-            is unknown. The pose is then that of the frame before.
-        last: the last frame that was tracked; None if no frame has been tracked.
-        lost_frames: number of frames that have been lost since the last one was tracked.
-        is_resumed: whether the camera continues from the end of an earlier drive.
-        seconds: duration of the motion since the frame before (``motion_seconds``).
-        times: ``(N,)`` timestamps of the frames before, in seconds (at most ``RECENT``).
-        inertial: the state of the IMU from which the pose was predicted; None if it was predicted
-            with constant velocity.
-    """
-
-    index: int
-    timestamp: float
-    T_cw: Matrix
-    twist: Matrix | None = None
-    last: Track | None = None
-    lost_frames: int = 0
-    is_resumed: bool = False
-    seconds: float = 0.0
-    times: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
-    inertial: InertialState | None = None
-
-    @property
-    def interval(self) -> float:
-        """Duration of the motion between the last two frames before; 0 if it is unknown."""
-        return motion_seconds(self.times) if len(self.times) > 1 else 0.0
-
-    @property
-    def is_tracking(self) -> bool:
-        """Whether the frame before was tracked."""
-        return self.last is not None and self.lost_frames == 0
-
-    @property
-    def lost(self) -> Track:
-        """The frame, if it cannot be tracked."""
-        return Track(self.index, self.timestamp, self.T_cw, twist=self.twist)
-
-    def standstill(self, view: MapView) -> Standstill | None:
-        """Return where the camera came to rest; None if it moves, or if the ids of landmarks may
-        have changed since."""
-        still = None if self.last is None else self.last.still
-        return still if still is not None and still.n_keyframes == view.n_keyframes else None
-
-    def last_seen(self, view: MapView) -> LastSeen | None:
-        """Return where the camera was last tracked, and how long ago that was; None if it has not
-        been tracked yet."""
-        if self.last is None:
-            return None
-        return LastSeen(view.reference, self.timestamp - self.last.timestamp)

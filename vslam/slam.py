@@ -20,6 +20,7 @@ from vslam.loopclosure.siamese.local_descriptors import KeyframeImages
 from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.method.gaps import Gap, find_gaps
+from vslam.method.hypotheses import map_gravity
 from vslam.method.inertia import IMU_REFUSED, is_refused
 from vslam.method.map_frames import in_first_part, keyframe_trajectory
 from vslam.method.session import Session
@@ -304,6 +305,18 @@ class Slam:
             RuntimeError: a keyframe is being mapped. Check ``is_mapping``, or call ``finish()``.
         """
         return self._session.published.map
+
+    @property
+    def gravity(self) -> NDArray[np.float64] | None:
+        """``(3,)`` acceleration of free fall in the world frame of the map, in m/s^2.
+
+        It is the mean over the keyframes. ``TrackResult.gravity`` is what is known at a frame. None
+        without an IMU, and until a keyframe was added after gravity became known.
+
+        Raises:
+            RuntimeError: a keyframe is being mapped. Check ``is_mapping``, or call ``finish()``.
+        """
+        return map_gravity(self.map, self._session.closing.closed)
 
     @property
     def frame(self) -> Track | None:

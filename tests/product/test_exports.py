@@ -26,6 +26,7 @@ from vslam.config import PoseGraphConfig, load_config
 from vslam.datasets import open_sequence
 from vslam.maps.colmap import save_colmap
 from vslam.maps.formats import landmark_colours, save_g2o, save_nerfstudio, save_ply
+from vslam.maps.level import T_UPRIGHT_CAMERA, level_world, turned
 from vslam.maps.new_output import new_output
 from vslam.maps.reconstruction import Reconstruction, reconstruction_of
 from vslam.maps.storage import load_map, save_map
@@ -37,6 +38,7 @@ from vslam.support.errors import InputError, ResultsError
 from vslam.types.camera import Camera
 from vslam.types.features import Features
 from vslam.types.geometry import inverses, se3_exp
+from vslam.types.imu import GRAVITY
 from vslam.types.loops import LoopEdge
 from vslam.types.map import Map
 from vslam.types.map_kernels import erase_landmark, link_many, unlink
@@ -378,6 +380,68 @@ def test_evo_reads_the_csv_of_euroc(tmp_path):
     read = read_euroc_csv_trajectory(tmp_path / "data.csv")
     np.testing.assert_allclose(read.timestamps, seconds, rtol=0, atol=1e-6)
     np.testing.assert_allclose(read.poses_se3, T_wc, atol=1e-9)
+
+
+# -- level exports --------------------------------------------------------------------------------
+
+TILTED = GRAVITY * Rotation.from_rotvec([0.3, 0.1, -0.2]).apply([0.0, 1.0, 0.0])
+
+
+def export(*words: object) -> str:
+    done = CliRunner().invoke(every_command(), ["export", *map(str, words)])
+    if done.exception is not None:
+        raise done.exception
+    return done.output
+
+
+@pytest.mark.parametrize("gravity", [TILTED, (0, 0, 1), (0, 0, -9.81), (0, -9.81, 0), (3, -9, 0)])
+def test_a_level_world_is_turned_until_z_points_up(gravity):
+    T = level_world(np.array(gravity, float))
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+    length = np.linalg.norm(gravity)
+    np.testing.assert_allclose(T[:3, :3] @ gravity, [0.0, 0.0, -length], atol=1e-8)
+
+
+def test_a_level_camera_keeps_its_right_and_looks_along_y():
+    np.testing.assert_array_equal(level_world(np.array([0.0, 9.81, 0.0])), T_UPRIGHT_CAMERA)
+
+
+def test_a_turned_map_looks_the_same(small):
+    level = turned(small, level_world(TILTED))
+    np.testing.assert_allclose(level.reprojection_errors(), small.reprojection_errors(), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_all_exports_of_a_run_have_the_same_level(kitti_tree, tmp_path):
+    write_results(tmp_path, replace(run_pipeline(kitti_tree), gravity=TILTED), pages=False)
+    write_options(tmp_path, RunOptions(data=str(kitti_tree), dataset="kitti", seq="00"))
+    for kind in ("euroc", "ply", "g2o", "colmap", "nerfstudio"):
+        export(kind, tmp_path, "--level", *["--text"] * (kind == "colmap"))
+    T_level_world = level_world(TILTED)
+    finished = read_run(tmp_path)
+    reconstruction = reconstruction_of(finished.map, finished.camera)
+    T_wc = T_level_world @ reconstruction.T_wc
+    _, values = gtsam.readG2o(str(tmp_path / "pose_graph.g2o"), True)
+    g2o = [values.atPose3(k).matrix() for k in reconstruction.frames.tolist()]
+    np.testing.assert_allclose(g2o, T_wc, atol=1e-9)
+    transforms = json.loads((tmp_path / "nerfstudio" / "transforms.json").read_text())
+    nerf = np.array([one["transform_matrix"] for one in transforms["frames"]])
+    np.testing.assert_allclose(nerf @ np.diag([1, -1, -1, 1]), T_wc, atol=1e-9)
+    np.testing.assert_allclose(transforms["applied_transform"], T_level_world[:3], atol=1e-9)
+    colmap = read_text(tmp_path / "colmap" / "sparse" / "0")
+    xyz = reconstruction.xyz @ T_level_world[:3, :3].T
+    np.testing.assert_allclose([one[0] for one in colmap.points.values()], xyz, atol=1e-9)
+    assert np.median(colmap.errors()) < 1.0
+    first = np.array((tmp_path / "trajectory_euroc.csv").read_text().splitlines()[1].split(","))
+    rotation = Rotation.from_quat(first[[5, 6, 7, 4]].astype(float)).as_matrix()
+    np.testing.assert_allclose(rotation, T_level_world[:3, :3], atol=1e-6)
+
+
+def test_a_run_without_an_imu_cannot_be_levelled(corridor_run, tmp_path):
+    with pytest.raises(InputError, match="--level needs gravity, which no IMU has measured"):
+        export("euroc", corridor_run, "--level", "--out", tmp_path / "level.csv")
+    assert not list(tmp_path.iterdir())
 
 
 # -- files are complete, and nothing is replaced --------------------------------------------------

@@ -7,9 +7,13 @@ from functools import cache
 import numpy as np
 import pytest
 from conftest import corridor_mipmaps, render
-from inertial import ADIS16448, Walk, seen_by
+from inertial import ADIS16448, DOWN, Flight, Walk, seen_by
+from typer.testing import CliRunner
 
-from vslam.method.inertia import IMU_REFUSED, with_samples
+from vslam.backend.inertial_start import PoseStretch, find_gravity
+from vslam.cli.main import every_command
+from vslam.maps.storage import load_map
+from vslam.method.inertia import IMU_REFUSED, gravity_direction, with_samples
 from vslam.slam import Slam
 from vslam.types.camera import Camera
 from vslam.types.features import TrackingState
@@ -210,6 +214,54 @@ def test_a_resumed_walk_gives_the_same_bytes(tmp_path, least):
     for slam in (whole, second):
         slam.finish()
     assert second.trajectory().T_wc.tobytes() == whole.trajectory().T_wc.tobytes()
+
+
+def test_the_map_keeps_gravity_and_exports_can_be_level(tmp_path):
+    slam = slam_with()
+    results = walk(slam, samples())
+    slam.finish()
+    down = TRUTH[0][:3, :3] @ WALK.pose(0.0)[:3, :3].T @ WALK.gravity
+    assert np.linalg.norm(slam.gravity) == pytest.approx(GRAVITY)
+    assert slam.gravity @ down / GRAVITY**2 > np.cos(np.radians(1.0))  # its bias is unknown
+    assert np.array_equal(results[0].T_wc, np.eye(4))
+
+    slam.save(tmp_path / "map.npz")
+    stored = load_map(tmp_path / "map.npz")
+    sigma = stored.map.keyframes.gravity_sigma
+    assert (sigma[stored.map.timestamps > 1.0] > 0.0).all()
+    assert (sigma[stored.map.timestamps < 0.5] == 0.0).all()
+    command = ["export", "ply", str(tmp_path / "map.npz"), "--no-colours", "--out"]
+    for name, words in (("map.ply", []), ("level.ply", ["--level"])):
+        done = CliRunner().invoke(every_command(), [*command, str(tmp_path / name), *words])
+        assert done.exit_code == 0, done.output
+    before, level = (points_of(tmp_path / name) for name in ("map.ply", "level.ply"))
+    np.testing.assert_allclose(level[:, 2], -before @ slam.gravity / GRAVITY, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(level, axis=1), np.linalg.norm(before, axis=1), 1e-4)
+
+
+def points_of(path) -> np.ndarray:
+    data = path.read_bytes()
+    return np.frombuffer(data[data.index(b"end_header\n") + 11 :], "<f4").reshape(-1, 3)
+
+
+def test_gravity_is_as_certain_as_it_says():
+    """Over seeds, errors of the direction along an axis have the standard deviation given."""
+    errors = []
+    for seed in range(8):
+        flight, rng = Flight(seed, speed=0.4, turning=0.4), np.random.default_rng(seed)
+        times = np.arange(0.0, 1.01, 0.05)
+        bias = np.concatenate([rng.normal(0.0, 0.02, 3), rng.normal(0.0, 0.1, 3)])
+        rows = flight.samples(np.arange(-0.02, 1.05, 0.005), bias, ADIS16448, seed)
+        poses = np.array([flight.pose(t) for t in times])
+        noise = np.array([se3_exp(rng.normal(0.0, [0.002] * 3 + [0.0005] * 3)) for _ in times])
+        stretch = PoseStretch(times, poses @ noise, 0.002, 0.0005)
+        calibration = ImuCalibration(np.eye(4), ADIS16448)
+        found = find_gravity(stretch, rows, calibration, known_scale=True)
+        one = gravity_direction(found.state, calibration)
+        true = poses[-1, :3, :3].T @ DOWN / GRAVITY
+        errors.append(np.linalg.norm(np.cross(one.direction, true)) / one.sigma / np.sqrt(2.0))
+        assert np.linalg.norm(one.direction) == pytest.approx(1.0)
+    assert 0.3 < np.sqrt(np.mean(np.square(errors))) < 2.0
 
 
 def test_old_samples_are_forgotten():

@@ -36,7 +36,7 @@ LINKS = {"first_row", "first_keyframe", "keyframe", "landmark", "next_row", "hea
 # Columns in which not every number is valid.
 RESTRICTED = FAMILY | LINKS | {
     "T_cw", "T_c_parent", "octave", "keyframe_alive", "landmark_alive", "fused_into",
-    "n_observations",
+    "n_observations", "gravity",
 }  # fmt: skip
 
 
@@ -73,6 +73,7 @@ def map_() -> Map:
     found.keyframes.parent[:N] = [-1, 0, 1, 1, 3, 2, 4]
     found.keyframes.T_c_parent[:N, 0, 3] = np.arange(1, N + 1)
     found.keyframes.restart[[3, 5]] = PREDICTED, UNPREDICTED
+    found.keyframes.gravity[:N] = np.eye(3)[np.arange(N) % 3]
     names = vars(Scalars())
     found.scalars = Scalars(**{name: type(value)(N - 1) for name, value in names.items()})
     return found

@@ -46,6 +46,7 @@ CLOSED = LoopEdge(
 )  # fmt: skip
 LOOPS = {12: [REJECTED], 42: [REJECTED, CLOSED, LOST], 45: [CLOSED], 70: [LOST]}
 SHIFTED_AT = 60
+GRAVITY_SINCE, DOWN = 11, np.array([0.0, 9.81, 0.0])
 
 
 def _pose(frame: int) -> NDArray[np.float64]:
@@ -63,7 +64,7 @@ def _result(frame: int) -> TrackResult:
     state = TrackingState.LOST if 40 <= frame < 44 else TrackingState.OK
     return TrackResult(
         frame, 0.1 * frame, _pose(frame), state, 2000, 1100, 500, 400, is_keyframe,
-        stage_ms=stage_ms,
+        stage_ms=stage_ms, gravity=None if frame < GRAVITY_SINCE else DOWN,
     )  # fmt: skip
 
 
@@ -142,6 +143,7 @@ def test_entities_and_their_frames(recording: Path) -> None:
     expected = {
         "world": 1,
         "world/camera": FRAMES,
+        "world/camera/gravity": 1 + FRAMES - GRAVITY_SINCE,
         "world/camera/image": 1 + keyframes,
         "world/camera/image/tracked": 1 + keyframes,
         "world/camera/image/untracked": 1 + keyframes,
@@ -170,6 +172,15 @@ def test_a_monocular_recording_counts_features_in_place_of_stereo_matches(tmp_pa
 def test_size_budget(recording: Path) -> None:
     # The map grows with the run, but adds at most 5 MB (30,000 points in one of 75 frames).
     assert 1000 / FRAMES * recording.stat().st_size + 5e6 < 50e6
+
+
+def test_gravity_is_recorded_in_the_frame_of_the_camera(recording: Path) -> None:
+    row = rows(recording, "world/camera/gravity")[-1]
+    assert row["frame"] == FRAMES - 1
+    arrow = np.array(row["Arrows3D:vectors"][0])
+    expected = _pose(FRAMES - 1)[:3, :3].T @ DOWN
+    cosine = arrow @ expected / np.linalg.norm(arrow) / np.linalg.norm(expected)
+    assert cosine == pytest.approx(1.0)
 
 
 def test_poses_keep_their_orientation(recording: Path) -> None:

@@ -6,6 +6,7 @@ import math
 import runpy
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -27,6 +28,7 @@ from vslam.maps.ros import (
     in_ros_axes,
     nanoseconds,
     odometry_message,
+    tf_message,
 )
 from vslam.maps.storage import load_map
 from vslam.report.folder import write_results
@@ -34,6 +36,7 @@ from vslam.support.errors import InputError
 from vslam.types.camera import Camera
 from vslam.types.features import TrackingState, TrackResult
 from vslam.types.geometry import inverse, se3_exp
+from vslam.types.imu import GRAVITY
 from vslam.types.odometry import PoseUncertainty
 from vslam.types.trajectory import read_trajectory
 
@@ -224,6 +227,25 @@ def test_covariances_are_those_of_errors_in_the_axes_of_ros():
         np.testing.assert_allclose(
             measured / np.outer(scale, scale), promised / np.outer(scale, scale), atol=0.1
         )
+
+
+def test_gravity_turns_the_map_until_z_points_up():
+    """The camera looked down by 0.2 rad and was rolled by 0.1 rad at the first frame."""
+    types = types_of_ros()
+    gravity = GRAVITY * Rotation.from_rotvec([0.2, 0.0, 0.1]).inv().apply([0.0, 1.0, 0.0])
+    unknown = FramePose.of(track(AHEAD, None), 10**9)
+    assert len(tf_message(types, unknown).transforms) == 2
+    pose = FramePose.of(replace(track(AHEAD, None), gravity=gravity), 10**9)
+    *same, level = tf_message(types, pose).transforms
+    assert same == tf_message(types, unknown).transforms
+    assert (level.header.frame_id, level.child_frame_id) == ("level", "map")
+    T_level_map = of_transform(level)
+    np.testing.assert_allclose(
+        T_level_map[:3, :3] @ T_BASE_OPTICAL[:3, :3] @ gravity, [0, 0, -GRAVITY], atol=1e-9
+    )
+    turn = Rotation.from_matrix(T_level_map[:3, :3]).as_rotvec()
+    assert turn[2] == pytest.approx(0.0, abs=1e-9)  # no turn about the vertical axis
+    assert not T_level_map[:3, 3].any()
 
 
 @pytest.mark.parametrize("timestamp", [-0.1, 1.6e12, math.nan])

@@ -50,6 +50,15 @@ Link = Annotated[
     bool, flag(OUTPUT, "Link to the images of the data set instead of copying them.", "--link")
 ]
 
+Level = Annotated[
+    bool,
+    flag(
+        OUTPUT,
+        "Turn the world until its z axis points up, along the gravity that an IMU has measured.",
+        "--level",
+    ),
+]
+
 
 def _out(default: str) -> typer.models.OptionInfo:
     is_file = "." in default
@@ -71,14 +80,19 @@ def colmap(
         bool, flag(OUTPUT, "Write text files instead of binary files.", "--text")
     ] = False,
     link: Link = False,
+    level: Level = False,
     quiet: Quiet = False,
 ) -> None:
     """Write the images of keyframes and a sparse model in COLMAP's format."""
     from vslam.maps.colmap import save_colmap
+    from vslam.maps.level import turned
+
+    T_level_world = _level_world(run) if level else None
 
     def save(folder: Path, model: Reconstruction, names: list[str], colours: Colours) -> None:
         sparse = folder / "sparse" / "0"
         sparse.mkdir(parents=True)
+        model = model if T_level_world is None else turned(model, T_level_world)
         save_colmap(sparse, model, names, colours, text=text)
 
     _export_images(run, data, out or run / "colmap", save, link=link, quiet=quiet)
@@ -90,13 +104,18 @@ def nerfstudio(
     data: Data = None,
     out: Annotated[Path | None, _out("nerfstudio")] = None,
     link: Link = False,
+    level: Level = False,
     quiet: Quiet = False,
 ) -> None:
     """Write the images of keyframes, their poses and the landmarks for nerfstudio."""
     from vslam.maps.formats import save_nerfstudio
+    from vslam.maps.level import T_UPRIGHT_CAMERA
+
+    T_saved_world = _level_world(run) if level else T_UPRIGHT_CAMERA
 
     def save(folder: Path, model: Reconstruction, names: list[str], colours: Colours) -> None:
-        save_nerfstudio(folder, model, [f"images/{name}" for name in names], colours)
+        images = [f"images/{name}" for name in names]
+        save_nerfstudio(folder, model, images, colours, T_saved_world)
 
     _export_images(run, data, out or run / "nerfstudio", save, link=link, quiet=quiet)
 
@@ -114,10 +133,12 @@ def ply(
             "--colours/--no-colours",
         ),
     ] = True,
+    level: Level = False,
     quiet: Quiet = False,
 ) -> None:
     """Write the landmarks as a point cloud. The colours are taken from the images."""
     from vslam.maps.formats import landmark_colours, save_ply
+    from vslam.maps.level import turned
     from vslam.maps.new_output import new_output
 
     if run.is_file():
@@ -135,7 +156,8 @@ def ply(
         if colours:
             frames = _keyframes(finished, data, quiet=quiet)
             seen = landmark_colours(reconstruction, map(_image_of, frames))
-        save_ply(file, reconstruction.xyz, seen)
+        shown = turned(reconstruction, _level_world(run)) if level else reconstruction
+        save_ply(file, shown.xyz, seen)
     _say(target, reconstruction, quiet=quiet)
 
 
@@ -143,6 +165,7 @@ def ply(
 def g2o(
     run: RunOrFile,
     out: Annotated[Path | None, _out("pose_graph.g2o")] = None,
+    level: Level = False,
     quiet: Quiet = False,
 ) -> None:
     """Write the pose graph: poses of keyframes, odometry and loop edges, and information
@@ -158,9 +181,12 @@ def g2o(
     ids = graph.keyframes  # frame numbers repeat in a map of several drives
     if len(set(map_.sessions)) == 1:
         ids = map_.frames[ids]
+    T_wc = inverses(graph.T_cw)
+    if level:
+        T_wc = _level_world(run) @ T_wc
     target = out or _beside(run, "pose_graph.g2o")
     with new_output(target) as file:
-        save_g2o(file, ids, inverses(graph.T_cw), graph.edges, graph.T_i_j, graph.sigmas)
+        save_g2o(file, ids, T_wc, graph.edges, graph.T_i_j, graph.sigmas)
     if not quiet:
         loops = np.count_nonzero(graph.kind == LOOP)
         typer.echo(f"{target}: {len(ids)} vertices, {len(graph.edges)} edges, {loops} from loops")
@@ -170,16 +196,21 @@ def g2o(
 def euroc(
     run: Run,
     out: Annotated[Path | None, _out("trajectory_euroc.csv")] = None,
+    level: Level = False,
     quiet: Quiet = False,
 ) -> None:
     """Write the trajectory in EuRoC's CSV format.
 
     Every run writes its trajectory in the formats of TUM and KITTI, too.
     """
+    from dataclasses import replace
+
     from vslam.maps.new_output import new_output
     from vslam.types.trajectory import read_trajectory, write_euroc
 
     trajectory = read_trajectory(run / "trajectory.tum")
+    if level:
+        trajectory = replace(trajectory, T_wc=_level_world(run) @ trajectory.T_wc)
     target = out or run / "trajectory_euroc.csv"
     with new_output(target) as file:
         write_euroc(file, trajectory)
@@ -218,7 +249,8 @@ def ros(
     odometry = read_trajectory(run / "trajectory_odom.tum")
     if not np.array_equal(odometry.timestamps, trajectory.timestamps):
         raise InputError(f"{run}: its trajectories have different frames; repeat the run.")
-    poses = frame_poses(odometry, trajectory, read_covariances(run / "covariance.csv"))
+    covariances = read_covariances(run / "covariance.csv")
+    poses = frame_poses(odometry, trajectory, covariances, _gravity(run))
     xyz = np.empty((0, 3))
     if (run / "map.npz").is_file():  # a run that only localises has no map of its own
         map_ = load_map(run).map
@@ -227,6 +259,31 @@ def ros(
         save_bag(file, poses, trajectory, xyz)
     if not quiet:
         typer.echo(f"{target}: {counted(len(poses), 'pose')}, {counted(len(xyz), 'landmark')}")
+
+
+def _gravity(run: Path) -> NDArray[np.float64] | None:
+    """Return gravity in the world frame of a run or of a map file, or None if it is unknown."""
+    import numpy as np
+
+    from vslam.maps.storage import load_map
+    from vslam.method.hypotheses import map_gravity
+    from vslam.report.schema import ReportJson
+
+    if run.is_file():
+        stored = load_map(run)
+        return map_gravity(stored.map, stored.loops)
+    gravity = ReportJson.read(run / "report.json").gravity
+    return None if gravity is None else np.array(gravity)
+
+
+def _level_world(run: Path) -> NDArray[np.float64]:
+    """Return ``(4, 4)`` ``T_level_world`` (``vslam.maps.level``)."""
+    from vslam.maps.level import level_world
+
+    gravity = _gravity(run)
+    if gravity is None:
+        raise InputError(f"{run}: --level needs gravity, which no IMU has measured; leave it out.")
+    return level_world(gravity)
 
 
 def _beside(run: Path, name: str) -> Path:

@@ -189,6 +189,10 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     _require(bool((data["keyframe_unit_scale"] > 1 / _MOST).all()), "keyframe_unit_scale")
     _check_ids("keyframe_restart", data["keyframe_restart"], CARRIED + 1)
     _require(not data["keyframe_restart"][:1].any(), "the first keyframe has a restart")
+    direction, sigma = data["keyframe_gravity"], data["keyframe_gravity_sigma"]
+    known, length = sigma > 0.0, np.linalg.norm(direction, axis=1)
+    is_unit = np.abs(length - known) < _ROTATION_TOLERANCE
+    _require(bool((sigma >= 0.0).all() and is_unit.all()), "keyframe_gravity")
     _check_ids("row_octave", data["row_octave"], len(scales))
     _require(bool((data["row_certainty"] > 0).all()), "row_certainty")
 

@@ -9,14 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.maps.level import T_UPRIGHT_CAMERA
 from vslam.maps.reconstruction import PIXEL_CENTRE, Reconstruction
+from vslam.types.geometry import transform
 from vslam.types.trajectory import quaternions
 
 POINTS = "sparse_pc.ply"
-# The axes of nerfstudio's world frame point right, forward and up, as seen from the first camera.
-T_SAVED_WORLD = np.array(
-    [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-)
 T_CAMERA_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _LUMA = np.array([299, 587, 114])  # weights of ITU-R BT.601, in thousandths
 
@@ -26,13 +24,14 @@ def save_nerfstudio(
     reconstruction: Reconstruction,
     names: list[str],
     colours: NDArray[np.uint8],
+    T_saved_world: NDArray[np.float64] = T_UPRIGHT_CAMERA,
 ) -> None:
     """Write a data set for nerfstudio: ``transforms.json``, and the landmarks as ``sparse_pc.ply``
     (https://docs.nerf.studio/quickstart/data_conventions.html).
 
     Cameras look along -z with y up (OpenGL). ``transform_matrix`` is the pose of a camera (camera
-    to world). The z axis of the world frame points up. ``applied_transform`` is the transformation
-    from vslam's world frame to the world frame of both files.
+    to world). The z axis of the world frame points up if the first camera was level.
+    ``applied_transform`` is the transformation from vslam's world frame to that of both files.
 
     Pixel coordinates begin at the corner of the image, as in COLMAP. The rays of nerfstudio go
     through ``column + 0.5`` (``Cameras.get_image_coords``), although its documentation suggests
@@ -42,12 +41,13 @@ def save_nerfstudio(
         folder: an existing folder.
         names: path of the image of each keyframe, relative to the folder.
         colours: ``(L, 3)`` RGB colours of the landmarks.
+        T_saved_world: ``(4, 4)``, maps points of vslam's world frame to that of the files.
 
     Raises:
         OSError: a file cannot be written.
     """
     camera = reconstruction.camera
-    poses = T_SAVED_WORLD @ reconstruction.T_wc @ T_CAMERA_OPENGL
+    poses = T_saved_world @ reconstruction.T_wc @ T_CAMERA_OPENGL
     content = {
         "camera_model": "OPENCV",
         "fl_x": camera.fx,
@@ -57,7 +57,7 @@ def save_nerfstudio(
         "w": camera.width,
         "h": camera.height,
         **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
-        "applied_transform": T_SAVED_WORLD[:3].tolist(),
+        "applied_transform": T_saved_world[:3].tolist(),
         "ply_file_path": POINTS,
         "frames": [
             {"file_path": name, "transform_matrix": pose.tolist()}
@@ -66,7 +66,7 @@ def save_nerfstudio(
     }
     folder = Path(folder)
     (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n")
-    save_ply(folder / POINTS, reconstruction.xyz @ T_SAVED_WORLD[:3, :3].T, colours)
+    save_ply(folder / POINTS, transform(T_saved_world, reconstruction.xyz), colours)
 
 
 def save_g2o(

@@ -6,6 +6,9 @@ follow REP 103. In ``map``, ``odom`` and ``base_link``, x points forward, y left
 is at the left camera. ``map`` and ``odom`` are at the first pose of ``base_link``. Lengths are in
 metres, or in the unit of a monocular map.
 
+If an IMU has measured gravity, ``level`` -> ``map`` turns ``map`` until z points up. The turn
+has no other part, and ``map`` itself never turns.
+
 The argument ``types`` is a function that returns the message class for the name of a message. Files
 are written with classes of the package rosbags. A ROS node uses the classes of ROS
 (``examples/ros2``).
@@ -22,12 +25,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.maps.level import level_world
 from vslam.support.errors import InputError
 from vslam.types.features import TrackResult
 from vslam.types.geometry import Matrix, adjoint, inverse, inverses, se3_log
 from vslam.types.trajectory import Trajectory, quaternions
 
-MAP, ODOM, BASE, OPTICAL = "map", "odom", "base_link", "camera_optical"
+LEVEL, MAP, ODOM, BASE, OPTICAL = "level", "map", "odom", "base_link", "camera_optical"
 Types = Callable[[str], Any]
 
 T_BASE_OPTICAL = np.array(
@@ -59,6 +63,8 @@ class FramePose:
             it is unknown.
         covariance: ``(6, 6)`` covariance of the pose relative to the start of the drive. None if it
             is unknown.
+        gravity: ``(3,)`` acceleration of free fall in the world frame of vslam. None if it is
+            unknown.
     """
 
     stamp: int
@@ -66,6 +72,7 @@ class FramePose:
     T_map_odom: Matrix
     near: Matrix | None = None
     covariance: Matrix | None = None
+    gravity: Matrix | None = None
 
     @classmethod
     def of(cls, result: TrackResult, stamp: int) -> FramePose:
@@ -81,6 +88,7 @@ class FramePose:
             result.T_map_odom,
             None if uncertainty is None else uncertainty.local,
             None if uncertainty is None else uncertainty.covariance,
+            result.gravity,
         )
 
     @property
@@ -122,11 +130,15 @@ def odometry_message(types: Types, pose: FramePose, before: FramePose | None) ->
 
 
 def tf_message(types: Types, pose: FramePose) -> Any:
-    """Create ``tf2_msgs/TFMessage`` with ``map`` -> ``odom`` and ``odom`` -> ``base_link``."""
+    """Create ``tf2_msgs/TFMessage`` with ``map`` -> ``odom`` and ``odom`` -> ``base_link``, and
+    with ``level`` -> ``map`` if gravity is known."""
     transforms = [
         _transform(types, pose.stamp, MAP, ODOM, in_ros_axes(pose.T_map_odom)),
         _transform(types, pose.stamp, ODOM, BASE, pose.T_odom_base),
     ]
+    if pose.gravity is not None:
+        T_level_map = level_world(pose.gravity, T_BASE_OPTICAL) @ T_BASE_OPTICAL.T
+        transforms.append(_transform(types, pose.stamp, LEVEL, MAP, T_level_map))
     return types("tf2_msgs/msg/TFMessage")(transforms=transforms)
 
 
@@ -247,7 +259,10 @@ def save_bag(
 
 
 def frame_poses(
-    odometry: Trajectory, trajectory: Trajectory, covariances: dict[str, tuple[Matrix, Matrix]]
+    odometry: Trajectory,
+    trajectory: Trajectory,
+    covariances: dict[str, tuple[Matrix, Matrix]],
+    gravity: Matrix | None = None,
 ) -> list[FramePose]:
     """Combine the trajectories and covariances of a run into one pose for each frame.
 
@@ -255,18 +270,19 @@ def frame_poses(
         odometry: poses of the camera in the odometry frame.
         trajectory: poses of the camera in the map frame, for the same frames as in ``odometry``.
         covariances: the two covariances of each frame by timestamp (``read_covariances``).
+        gravity: ``(3,)`` acceleration of free fall in the map frame. None if it is unknown.
 
     Raises:
         InputError: ROS cannot represent a time.
     """
     times = odometry.timestamps.tolist()
     corrections = trajectory.T_wc @ inverses(odometry.T_wc)
-    return [
-        FramePose(
-            nanoseconds(timestamp), *motions, *covariances.get(f"{timestamp:.6f}", (None, None))
-        )
-        for timestamp, *motions in zip(times, odometry.T_wc, corrections, strict=True)
-    ]
+    found = []
+    for timestamp, T_odom_camera, T_map_odom in zip(times, odometry.T_wc, corrections, strict=True):
+        near, covariance = covariances.get(f"{timestamp:.6f}", (None, None))
+        stamp = nanoseconds(timestamp)
+        found.append(FramePose(stamp, T_odom_camera, T_map_odom, near, covariance, gravity))
+    return found
 
 
 def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:

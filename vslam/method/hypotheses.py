@@ -36,6 +36,7 @@ from vslam.backend.similarity_graph import (
 )
 from vslam.config import PoseGraphConfig
 from vslam.types.geometry import Matrix, compose, inverse, inverses, orthonormalised
+from vslam.types.imu import GRAVITY
 from vslam.types.loops import LoopEdge
 from vslam.types.map import CARRIED, Map
 
@@ -150,6 +151,30 @@ def joined_submaps(map_: Map, closed: Sequence[LoopEdge]) -> NDArray[np.int64]:
     joined += [(int(one), int(map_.parents[one])) for one in carried]
     ends = np.array(joined, np.int64).reshape(-1, 2)
     return parts_of(submap[ends], len(submap))[submap]
+
+
+def map_gravity(map_: Map, closed: Sequence[LoopEdge]) -> Matrix | None:
+    """Return the ``(3,)`` acceleration of free fall in the world frame of a map, in m/s^2.
+
+    It is the mean of what an IMU measured at the keyframes, weighted by the inverse variances.
+    Keyframes whose pose in the world was not measured are left out.
+
+    Args:
+        closed: the closed loops, which join sub-maps.
+
+    Returns:
+        None if gravity is not known.
+    """
+    keyframes = map_.living_keyframes()
+    sigma = map_.keyframes.gravity_sigma[keyframes]
+    known = (sigma > 0.0) & (joined_submaps(map_, closed)[keyframes] == 0)
+    if not known.any():
+        return None
+    keyframes, weights = keyframes[known], sigma[known] ** -2.0
+    T_cw, directions = map_.arrays.T_cw[keyframes], map_.keyframes.gravity[keyframes]
+    total = np.einsum("n,nji,nj->i", weights, T_cw[:, :3, :3], directions)
+    gravity: Matrix = GRAVITY / np.linalg.norm(total) * total
+    return gravity
 
 
 def part_of(map_: Map, closed: Sequence[LoopEdge], keyframe: int) -> int:

@@ -17,6 +17,9 @@ from dataclasses import replace
 import numpy as np
 
 from vslam.backend.inertial_filter import (
+    FALL,
+    TURN,
+    N,
     anchored,
     camera_covariance,
     camera_pose,
@@ -25,8 +28,16 @@ from vslam.backend.inertial_filter import (
     propagated,
 )
 from vslam.backend.inertial_start import MAX_MISFIT, PoseStretch, find_gravity
+from vslam.backend.preintegration import cross_matrix
 from vslam.types.geometry import Matrix, inverse
-from vslam.types.imu import ImuCalibration, Inertia, InertialState, tidied
+from vslam.types.imu import (
+    GRAVITY,
+    GravityDirection,
+    ImuCalibration,
+    Inertia,
+    InertialState,
+    tidied,
+)
 
 CARRIED_S = 3.0  # s without images after which a pose counts as lost, not as carried by the IMU
 # A gap between samples above which they do not tell the motion, in seconds.
@@ -172,6 +183,17 @@ def predicted_motion(
 def predicted_covariance(predicted: InertialState, calibration: ImuCalibration) -> Matrix:
     """Return the ``(6, 6)`` covariance of a predicted pose (``PoseUncertainty.local``)."""
     return camera_covariance(predicted, calibration.T_imu_camera)
+
+
+def gravity_direction(state: InertialState, calibration: ImuCalibration) -> GravityDirection:
+    """Return the direction of free fall in the frame of the camera."""
+    R = state.T_world_imu[:3, :3]
+    gravity = R.T @ state.gravity / GRAVITY
+    A = np.concatenate([cross_matrix(gravity), R.T / GRAVITY], axis=1)  # by the errors of R and g
+    errors = [*range(N)[TURN], *range(N)[FALL]]
+    across = float(np.trace(A @ state.covariance[np.ix_(errors, errors)] @ A.T))
+    direction: Matrix = calibration.T_imu_camera[:3, :3].T @ gravity
+    return GravityDirection(direction, np.sqrt(across / 2.0))
 
 
 def _forgotten(inertia: Inertia) -> Inertia:

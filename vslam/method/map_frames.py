@@ -49,7 +49,7 @@ def add_frame(
         predicted: if the keyframe begins a sub-map, whether its pose was predicted.
     """
     keyframe = map_.add_keyframe(
-        track.refined_features(), track.T_cw, track.timestamp, track.index, certainty
+        track.refined_features(), track.T_cw, track.timestamp, track.index, certainty, track.gravity
     )
     tracked = np.flatnonzero(track.landmark >= 0)
     link_many(map_.arrays, map_.rows(keyframe).start + tracked, track.landmark[tracked])
@@ -73,9 +73,9 @@ def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, 
         The ids of the two keyframes.
     """
     one, two, T_1_w = start.first, start.second, start.first.T_cw
-    first = map_.add_keyframe(one.features, T_1_w, one.timestamp, one.index)
+    first = map_.add_keyframe(one.features, T_1_w, one.timestamp, one.index, gravity=one.gravity)
     T_2_w = compose(start.T_2_1, T_1_w)
-    second = map_.add_keyframe(two.features, T_2_w, two.timestamp, two.index)
+    second = map_.add_keyframe(two.features, T_2_w, two.timestamp, two.index, gravity=two.gravity)
     rows = [
         map_.rows(keyframe).start + features
         for keyframe, features in zip((first, second), start.features, strict=True)

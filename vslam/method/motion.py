@@ -12,6 +12,7 @@ from vslam.frontend.standstill import has_come_to_rest, is_small
 from vslam.frontend.tracking import uncertainty_of
 from vslam.method.inertia import (
     CARRIED_S,
+    gravity_direction,
     lost,
     predicted_covariance,
     predicted_motion,
@@ -109,8 +110,9 @@ class Motion:
         """Follow the camera to the next frame, before the pose of this frame is recorded.
 
         Returns:
-            The frame with its velocity. A relocalised frame has none, because the jump to its pose
-            is not a motion of the camera.
+            The frame with its velocity and with gravity, if they are known. The velocity of a
+            relocalised frame is unknown, because the jump to its pose is not a motion of the
+            camera.
         """
         if track.is_lost:
             inertia = self._carried(track, predicted)
@@ -119,7 +121,7 @@ class Motion:
             odometry = self._followed(track, track.T_cw, predicted)
             n_lost = self.state.lost_frames + (track.state != TrackingState.DROPPED)
             self.state = MotionState(odometry, n_lost, inertia)
-            return track
+            return self._with_gravity(track)
         found_again = track.by is By.PLACE or not predicted.is_tracking
         track = self._with_velocity(track, predicted, view)
         covariance, of_offset = uncertainty_of(track, view.offset_sigma, self._context)
@@ -129,24 +131,11 @@ class Motion:
         )
         inertia = self._learned(track, predicted, odometry, found_again=found_again)
         self.state = MotionState(odometry, 0, inertia)
-        return track
+        return self._with_gravity(track)
 
     def add_samples(self, samples: Matrix) -> None:
         """Add samples of the IMU, see ``Slam.add_imu``."""
         self.state = replace(self.state, inertia=with_samples(self.state.inertia, samples))
-
-    def gravity(self, T_wc: Matrix) -> Matrix | None:
-        """Return the ``(3,)`` acceleration of free fall in the world frame of the map, in m/s^2.
-
-        Args:
-            T_wc: ``(4, 4)`` pose of the last frame in the map, of the camera as it is mounted.
-        """
-        state = self.state.inertia.state
-        if state is None:
-            return None
-        R_odom_camera = self.state.odometry.T_odom_camera[:3, :3]
-        gravity: Matrix = T_wc[:3, :3] @ R_odom_camera.T @ state.gravity
-        return gravity
 
     def _carried(self, track: Track, predicted: Prediction) -> Inertia:
         """Return what is known from the IMU after a frame that was not tracked."""
@@ -169,6 +158,18 @@ class Motion:
             inertia, inertial, track.timestamp, T_odom_camera, local, self._imu,
             stands_still=track.by is By.STANDSTILL,
         )  # fmt: skip
+
+    def _with_gravity(self, track: Track) -> Track:
+        """Return a frame, to which the state of the IMU has moved, with the direction of gravity in
+        the camera that is tracked."""
+        state = self.state.inertia.state
+        if state is None or self._imu is None:
+            return track
+        found = gravity_direction(state, self._imu)
+        if self._context.camera.quarter_turns:
+            R = self._context.camera.T_mounted_camera[:3, :3]
+            found = replace(found, direction=R.T @ found.direction)
+        return replace(track, gravity=found)
 
     def _as_tracked(self, T_now_last: Matrix) -> Matrix:
         """Return a motion of the camera as it is mounted as a motion of the camera that is tracked,

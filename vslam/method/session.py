@@ -34,7 +34,7 @@ from vslam.types.context import Context
 from vslam.types.features import TrackingState, TrackResult
 from vslam.types.frame_poses import FrameTable
 from vslam.types.geometry import Matrix, inverse, orthonormalised, se3_log
-from vslam.types.imu import ImuCalibration
+from vslam.types.imu import GRAVITY, ImuCalibration
 from vslam.types.map import Map
 from vslam.types.states import Checkpoint, ClosingState
 from vslam.types.track import By, Track
@@ -314,7 +314,9 @@ class Session:
             part=self.published.view.part,
             support=track.support,
             stands_still=track.by is By.STANDSTILL,
-            gravity=self._motion.gravity(T_wc),
+            gravity=None
+            if track.gravity is None
+            else GRAVITY * inverse(track.T_cw)[:3, :3] @ track.gravity.direction,
         )
 
     # The state of the drive

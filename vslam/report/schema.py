@@ -240,6 +240,8 @@ class ReportJson(Measures, Document):
     - ``warnings``: sentences about problems of the images or the rig that the run has detected,
       and about ``gaps``.
     - ``gaps``: stretches of frames whose final poses relative to the world frame were not measured.
+    - ``gravity``: acceleration of free fall in the world frame of the trajectory and the map, in
+      m/s^2. None if no IMU has measured it.
     - ``evaluation_remark``: the reason why no errors were computed, or the number of frames that
       the errors cover.
     - ``latency_ms``: milliseconds from an image to its pose in a real-time run. None for other
@@ -282,6 +284,7 @@ class ReportJson(Measures, Document):
     landmarks: int
     submaps: int
     gaps: tuple[GapEntry, ...] = ()
+    gravity: tuple[float, float, float] | None = None
     loops_rejected: int
     revisit_stretches: int | None
     revisits: list[RevisitEntry]

@@ -98,6 +98,7 @@ def summarize(
         landmarks=outcome.n_landmarks,
         submaps=outcome.n_submaps,
         gaps=tuple(GapEntry(**vars(gap)) for gap in outcome.gaps),
+        gravity=None if outcome.gravity is None else tuple(outcome.gravity.tolist()),
         loops_rejected=sum(not loop.accepted for loop in loops),
         revisit_stretches=len(verdict.revisits) if verdict else None,
         revisits=_revisits(verdict) if verdict else [],

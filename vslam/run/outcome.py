@@ -64,6 +64,8 @@ class RunOutcome:
             Culled keyframes are included. The index is -1 for keyframes of earlier drives.
         n_submaps: number of sub-maps, including the first map. 0 if the map has no keyframe.
         gaps: stretches whose final poses relative to the world frame were not measured.
+        gravity: ``(3,)`` acceleration of free fall in the world frame, in m/s^2. None if no IMU has
+            measured it.
         gps_track: the georeferenced drive. None if the run has no GPS.
         interrupted: the reason why the run ended early, such as "Ctrl-C" or a truncated file.
         compared: the outcome of each loop detector in ``settings.compare``, without its map. The
@@ -94,6 +96,7 @@ class RunOutcome:
     keyframe_frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     n_submaps: int = 1
     gaps: list[Gap] = field(default_factory=list)
+    gravity: NDArray[np.float64] | None = None
     gps_track: GpsTrack | None = None
     interrupted: str | None = None
     step_s: float = 0.0

@@ -33,6 +33,7 @@ from vslam.support.plugins import reason
 from vslam.types.camera import Camera, Image
 from vslam.types.features import TrackingState, TrackResult
 from vslam.types.geometry import inverses
+from vslam.types.imu import GRAVITY
 from vslam.types.loops import LoopEdge
 from vslam.types.map import Map
 from vslam.types.trajectory import Trajectory
@@ -297,6 +298,8 @@ class RerunRecorder(Recorder):
     - ``world/camera``: the pose of every frame;
     - ``world/camera/image``: images of keyframes at half size. Its children ``tracked`` and
       ``untracked`` are the keypoints;
+    - ``world/camera/gravity``: an arrow along gravity, in the frame of the camera, for every frame
+      at which it is known;
     - ``world/landmarks``, ``world/keyframes``: the map. It is recorded every 25 keyframes, after
       loops and at the end;
     - ``world/loops/accepted``: a green line for each closed loop;
@@ -349,6 +352,7 @@ class RerunRecorder(Recorder):
         self._hide_rejected_at: int | None = None  # index of a frame
         self._ground_truth: Trajectory | None = None  # None after it was recorded
         self._T_mounted_camera = np.eye(4)
+        self._arrow = 1.0  # length of the viewing pyramid and of the arrow along gravity
         try:
             # Otherwise, the time of logging would be the viewer's default timeline.
             self._recording.set_log_time_enabled(False)
@@ -367,13 +371,13 @@ class RerunRecorder(Recorder):
         log = functools.partial(self._recording.log, static=True)
         self._recording.send_blueprint(_blueprint())
         log("world", rr.ViewCoordinates.RDF)
-        s = _IMAGE_SCALE
+        s, self._arrow = _IMAGE_SCALE, 4.0 * (camera.baseline or 0.5)
         pinhole = rr.Pinhole(
             focal_length=[s * camera.fx, s * camera.fy],
             principal_point=list(_half(np.array([camera.cx, camera.cy]))),
             resolution=[round(s * camera.width), round(s * camera.height)],
             camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=4.0 * (camera.baseline or 0.5),
+            image_plane_distance=self._arrow,
         )
         log("world/camera/image", pinhole)
         for name, color, radius in (("tracked", _GREEN, -2.0), ("untracked", _GREY, -1.0)):
@@ -384,6 +388,7 @@ class RerunRecorder(Recorder):
         self._points = {usable: _GREY, "matches": _AMBER, "inliers": _BLUE}
         for name, color in self._points.items():
             log(f"points/{name}", rr.SeriesLines(colors=[color], names=[name]))
+        log("world/camera/gravity", rr.Arrows3D.from_fields(colors=[_VIOLET], labels=["gravity"]))
         log("world/trajectory", rr.LineStrips3D.from_fields(colors=[_BLUE], radii=[-1.0]))
         self._ground_truth, self._T_mounted_camera = ground_truth, camera.T_mounted_camera
 
@@ -535,6 +540,13 @@ class RerunRecorder(Recorder):
         T_wc = np.array([result.T_wc for result in results]) @ self._T_mounted_camera
         poses = rr.Transform3D.columns(translation=T_wc[:, :3, 3], mat3x3=T_wc[:, :3, :3])
         self._recording.send_columns("world/camera", _times(results), poses)
+        fallen = [k for k, result in enumerate(results) if result.gravity is not None]
+        if fallen:
+            gravity = np.array([results[k].gravity for k in fallen]) / GRAVITY
+            arrows = self._arrow * np.einsum("nji,nj->ni", T_wc[fallen, :3, :3], gravity)
+            columns = rr.Arrows3D.columns(vectors=arrows)
+            times = _times([results[k] for k in fallen])
+            self._recording.send_columns("world/camera/gravity", times, columns)
         extracted = [result for result in results if result.n_features]
         for name in self._points:
             counted = results if name in ("matches", "inliers") else extracted

@@ -235,6 +235,7 @@ class SlamRun:
             keyframe_frames=keyframe_frames,
             n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
             gaps=slam.gaps(),
+            gravity=slam.gravity,
         )
 
     def _source_warnings(self, pair_warnings: list[str]) -> list[str]:

@@ -208,6 +208,19 @@ class InertialState:
 
 
 @dataclass(frozen=True, eq=False)
+class GravityDirection:
+    """The direction of free fall in the frame of a camera.
+
+    Attributes:
+        direction: ``(3,)`` unit vector.
+        sigma: standard deviation along each of the two axes across it, in radians.
+    """
+
+    direction: Matrix
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
 class Inertia:
     """What is known from the IMU, between two frames.
 

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from vslam.types.features import Features
 from vslam.types.geometry import adjoint, compose, inverse, orthonormalised
+from vslam.types.imu import GravityDirection
 from vslam.types.loops import LoopEdge
 from vslam.types.map_kernels import count_shared, detach_keyframe, resolve
 from vslam.types.revisits import Revisits
@@ -121,6 +122,10 @@ class KeyframeTable(NamedTuple):
             begins after the camera was lost. The value is ``PREDICTED`` if the pose of the keyframe
             relative to its parent was predicted, ``UNPREDICTED`` if it is unknown, and ``CARRIED``
             if an IMU measured it.
+        gravity: ``(K, 3)`` f8, direction of free fall in the frame of the camera, as a unit vector.
+            It is zero if it was unknown when the keyframe was added.
+        gravity_sigma: ``(K,)`` f8, standard deviation of ``gravity`` along each of the two axes
+            across it, in radians. It is zero if ``gravity`` is unknown.
     """
 
     timestamp: NDArray[np.float64] = np.zeros(0)
@@ -130,6 +135,8 @@ class KeyframeTable(NamedTuple):
     unit_scale: NDArray[np.float64] = np.zeros(0)
     T_c_parent: NDArray[np.float64] = np.zeros((0, 4, 4))
     restart: NDArray[np.uint8] = np.zeros(0, np.uint8)
+    gravity: NDArray[np.float64] = np.zeros((0, 3))
+    gravity_sigma: NDArray[np.float64] = np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -239,6 +246,7 @@ class Map:
         timestamp: float,
         frame: int,
         certainty: NDArray[np.uint8] | int = 1,
+        gravity: GravityDirection | None = None,
     ) -> int:
         """Append a keyframe without observations, and return its id.
 
@@ -247,6 +255,7 @@ class Map:
             timestamp: seconds.
             frame: index of the frame that becomes the keyframe.
             certainty: ``Arrays.certainty`` of each feature, or of all features.
+            gravity: in the frame of the keyframe; None if it is unknown.
         """
         k, n = self.n_keyframes, len(features)
         self._reserve_keyframes(1)
@@ -269,6 +278,8 @@ class Map:
         table.session[k] = self.scalars.session
         table.unit_scale[k] = 1.0
         table.T_c_parent[k] = np.eye(4)
+        if gravity is not None:
+            table.gravity[k], table.gravity_sigma[k] = gravity.direction, gravity.sigma
         self.n_rows += n
         self.n_keyframes += 1
         return k

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from vslam.types.features import Extracted, Features, Pyramid, TrackingState
 from vslam.types.geometry import Matrix
+from vslam.types.imu import GravityDirection
 
 
 class By(StrEnum):
@@ -99,6 +100,7 @@ class Track:
         coarse: the small images of the frame (``coarse_levels``), to which the next frame is
             aligned; None if frames are not aligned.
         is_keyframe: whether the frame became a keyframe.
+        gravity: direction of free fall in the frame of the camera; None if it is unknown.
     """
 
     index: int
@@ -120,6 +122,7 @@ class Track:
     still: Standstill | None = None
     coarse: Pyramid | None = None
     is_keyframe: bool = False
+    gravity: GravityDirection | None = None
 
     @property
     def features(self) -> Features:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline, Slerp
+from scipy.spatial.transform import Rotation, Slerp
 
 from vslam.backend.preintegration import right_jacobian, so3_exp
 from vslam.types.imu import GRAVITY, ImuNoise
@@ -157,18 +156,3 @@ def seen_by(samples: np.ndarray, T_imu_camera: np.ndarray, flight: Flight) -> np
         force = samples[k, 4:] + np.cross(turning, arm) + np.cross(w, np.cross(w, arm))
         moved[k, 1:4], moved[k, 4:] = R @ w, R @ force
     return moved
-
-
-def samples_along(times: np.ndarray, T_wc: np.ndarray) -> np.ndarray:
-    """Return the exact samples of an IMU at the camera of a drive, whose poses a spline connects.
-
-    Args:
-        times: ``(N,)`` seconds.
-        T_wc: ``(N, 4, 4)`` poses of the camera in a world frame whose y axis points down.
-    """
-    place = CubicSpline(times, T_wc[:, :3, 3])
-    turns = RotationSpline(times, Rotation.from_matrix(T_wc[:, :3, :3]))
-    at = np.arange(times[0], times[-1], 0.005)
-    R_cw = np.swapaxes(turns(at).as_matrix(), 1, 2)
-    force = place(at, 2) - np.array([0.0, GRAVITY, 0.0])
-    return np.column_stack([at, turns(at, 1), np.einsum("nij,nj->ni", R_cw, force)])

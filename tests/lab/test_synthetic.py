@@ -633,7 +633,7 @@ def test_a_name_says_how_the_town_varies():
     for name in ("05+fog", "05+change:2", "05+change", "05+moving:x", "05+seed:", "05+"):
         with pytest.raises(InputError, match=r"--seq 05\+.* is not understood"):
             parse_drive(name)
-    with pytest.raises(InputError, match=r"route 77: unknown; choose one of demo, .*, lane, night"):
+    with pytest.raises(InputError, match=r"route 77: unknown; choose one of .*, drone, night"):
         open_sequence("synthetic", None, "77+change:0.5")
 
 

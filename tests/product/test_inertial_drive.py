@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from inertial import ADIS16448, samples_along
+from inertial import ADIS16448
 
 from vslam.datasets.kitti import open_kitti
 from vslam.slam import Slam
@@ -15,6 +15,7 @@ from vslam.types.camera import Camera
 from vslam.types.features import TrackingState
 from vslam.types.geometry import inverse, se3_log
 from vslam.types.imu import ImuCalibration
+from vslam_lab.towns.inertial import samples_along
 from vslam_lab.towns.routes import built_in_route
 from vslam_lab.towns.site import Variation
 from vslam_lab.towns.store import render_sequence
@@ -50,7 +51,7 @@ def noise(n: int) -> np.ndarray:
 def drive_through(drive, imu: ImuCalibration | None) -> tuple[Slam, list, np.ndarray]:
     camera: Camera = drive[0]
     _, times, images, T_wc = drive
-    rows = samples_along(times, T_wc)
+    rows = samples_along(times, T_wc, np.eye(4))
     rows[:, 1:] += noise(len(rows))
     slam, results, before = Slam(camera, imu=imu, detector="none", threads=1), [], -1.0
     for k, (left, right) in enumerate(images):

@@ -23,6 +23,9 @@ from vslam.calibration.imu import NOISE_KEYS, is_imu, read_imu
 from vslam.calibration.models import Calibration, CameraModel
 from vslam.support.errors import InputError, write_file
 
+CALIBRATION = "calibration.yaml"
+"""The name of the calibration file in a folder of images."""
+
 NEEDED_CALIBRATION = (
     "give a file with the cameras' focal lengths, centres, distortion and, for two cameras, "
     "baseline (docs/howto/cameras.md)"

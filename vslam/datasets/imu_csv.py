@@ -18,6 +18,9 @@ from vslam.support.file_kinds import read_text
 from vslam.types.geometry import Matrix
 from vslam.types.imu import GRAVITY
 
+IMU_FILE = "imu.csv"
+"""The name of the file beside images."""
+
 HEADER = "time,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
 """The names of the columns in a file of the user's own, for messages."""
 

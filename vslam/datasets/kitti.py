@@ -5,6 +5,8 @@ root/sequences/NN/image_1/000000.png   rectified images of the right camera
 root/sequences/NN/calib.txt            calibration
 root/sequences/NN/times.txt            times in seconds
 root/poses/NN.txt                      ground truth, for the sequences 00 to 10
+root/sequences/NN/imu.csv              optional: inertial samples, see `vslam.datasets.imu_csv`
+root/sequences/NN/calibration.yaml     optional: where the IMU is, see docs/howto/imu.md
 
 If there are no grey images, the colour images in image_2 and image_3 are read instead. The images
 may also have other formats, such as JPEG or WebP.
@@ -14,6 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from collections.abc import Sequence as Several
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +26,8 @@ from numpy.typing import NDArray
 from vslam.calibration import files as calibration_files
 from vslam.datasets.frames import Source
 from vslam.datasets.image_files import checked_files, list_images, select_frames
+from vslam.datasets.imu import Imu
+from vslam.datasets.imu_csv import IMU_FILE, read_imu_csv
 from vslam.datasets.rectified import rectified
 from vslam.datasets.times import FIX_LIST, ordered_list, times_of_list
 from vslam.support.errors import InputError, UnreadableImageError
@@ -93,6 +99,7 @@ def open_kitti(
             f"has {right[0]} pixels but the left image has {left}; use the rectified images of "
             "both cameras.",
         )
+    images = replace(images, imu=_imu_of(folder))
     if calib:
         return rectified(images, calibration_files.read_calibration(calib, images.sizes[0]))
     width, height = images.sizes[0]
@@ -103,6 +110,7 @@ def open_kitti(
         stored=images.stored,
         ground_truth=images.ground_truth,
         timing=timing,
+        imu=images.imu,
     )
 
 
@@ -294,6 +302,18 @@ def row_numbers(path: Path, stems: list[str], n_rows: int) -> NDArray[np.int64]:
     if rows[-1] >= n_rows:
         raise InputError(f"{path}: has {n_rows} rows but none for image {stems[-1]}; {fix}.")
     return rows
+
+
+def _imu_of(folder: Path) -> Imu | None:
+    """Find the IMU of a sequence. KITTI's own sequences have none."""
+    file, calibration = folder / IMU_FILE, folder / calibration_files.CALIBRATION
+    if not file.is_file():
+        return None
+    imu = Imu(str(file), partial(read_imu_csv, file))
+    if not calibration.is_file():
+        return imu
+    found = calibration_files.read_calibration([calibration])
+    return replace(imu, calibration=found.imu, noise=found.imu_noise)
 
 
 def _read_ground_truth(

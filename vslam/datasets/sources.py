@@ -14,7 +14,7 @@ from vslam.datasets.detection import detect_dataset
 from vslam.datasets.frames import RawSource, Source, selected
 from vslam.datasets.image_files import depth_scale_of, list_images
 from vslam.datasets.imu import Imu
-from vslam.datasets.imu_csv import read_imu_csv
+from vslam.datasets.imu_csv import IMU_FILE, read_imu_csv
 from vslam.datasets.kitti_raw import is_kitti_raw
 from vslam.datasets.masks import with_masks
 from vslam.datasets.rectified import rectified
@@ -30,7 +30,6 @@ _APPLIES_TO = {
     "imu_topics": ("bag",),
     "depth_scale": ("tum", "images", "bag"),
 }
-_IMU_FILE = "imu.csv"
 _NOT_MONOCULAR = ("right", "depth", "depth_scale")
 
 
@@ -174,8 +173,8 @@ def _imu_beside(data: Path) -> Imu | None:
 
     For ``drive.mp4``, the file is ``drive.imu.csv`` or ``imu.csv``.
     """
-    named = [data.with_suffix(".imu.csv")] if data.is_file() else [data / _IMU_FILE]
-    files = [*named, data.resolve().parent / _IMU_FILE]
+    named = [data.with_suffix(".imu.csv")] if data.is_file() else [data / IMU_FILE]
+    files = [*named, data.resolve().parent / IMU_FILE]
     file = next((file for file in files if file.is_file()), None)
     return None if file is None else Imu(str(file), partial(read_imu_csv, file))
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.calibration.files import read_calibration
+from vslam.calibration.files import CALIBRATION, read_calibration
 from vslam.calibration.models import Calibration, CameraModel
 from vslam.datasets.association import DEPTH_NEAR_S, Pairing, associate, read_ground_truth
 from vslam.datasets.frames import Source
@@ -37,7 +37,6 @@ from vslam.support.errors import InputError
 from vslam.support.file_kinds import what_is_in
 
 _HOME = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset"
-CALIBRATION = "calibration.yaml"
 _DEPTH_SCALE = 5000.0  # from TUM's page "File Formats"
 # From TUM's page "Intrinsic Camera Calibration"; the images of freiburg3 are already undistorted.
 _CAMERAS = {

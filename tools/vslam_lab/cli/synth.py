@@ -17,6 +17,7 @@ _EXAMPLES = """
   vslam synth 05 --change 0.5 --dynamic 6
   vslam synth mine --trajectory poses/07.txt --calibration 04-12
   vslam synth block --side-by-side block.mkv
+  vslam synth room --imu --seed 3
   vslam synth block --fisheye --out fisheye
   vslam synth demo --rgbd --out rgbd
   vslam synth demo --pairs 1000 --aliased --change 0.8 --out pairs
@@ -73,6 +74,15 @@ def synth(
     ] = 0.0,
     depth: Annotated[
         bool, flag(OUTPUT, "Also write 16-bit depth images in centimetres.", "--depth")
+    ] = False,
+    imu: Annotated[
+        bool,
+        flag(
+            OUTPUT,
+            "Also write imu.csv, the samples of an IMU on the camera at 200 Hz, and "
+            "calibration.yaml.",
+            "--imu",
+        ),
     ] = False,
     side_by_side: Annotated[
         Path | None,
@@ -133,26 +143,28 @@ def synth(
     threads: Threads = None,
     quiet: Quiet = False,
 ) -> None:
-    """Render a drive through a town, in KITTI's format and with exact ground truth."""
+    """Render a drive through a town, or a flight through a hall, with exact ground truth."""
     from vslam.cli.console import Console
     from vslam.support.machine import available_cores
     from vslam.types.trajectory import read_kitti_poses
     from vslam_lab.towns import (
         DRIVES,
+        MOTIONS,
         ROUTES,
         Variation,
-        built_in_route,
         parse_drive,
+        route_named,
         route_of_poses,
         store,
     )
+    from vslam_lab.towns.inertial import write_imu
 
     cache = out or store.cache_folder()
     town = Variation()
     if trajectory is None and route in DRIVES:
         route, town = parse_drive(route)
     if list_:
-        for name, about in ROUTES.items():
+        for name, about in (ROUTES | MOTIONS).items():
             typer.echo(f"{name:<6}{about}")
         for name, drive_of in DRIVES.items():
             typer.echo(f"{name:<6}the drive {drive_of}")
@@ -171,21 +183,24 @@ def synth(
     if side_by_side is not None and (pairs or fisheye):
         raise InputError("--side-by-side: writes a sequence; leave out --pairs and --fisheye.")
     if not route:
-        raise InputError(f"vslam synth: give a route, one of {', '.join(ROUTES)}, or --list.")
+        known = ", ".join(ROUTES | MOTIONS)
+        raise InputError(f"vslam synth: give a route, one of {known}, or --list.")
+    variation = Variation(
+        seed or town.seed, aliased or town.aliased, change or town.change, dynamic or town.moving
+    )
     drive = (
-        built_in_route(route)
+        route_named(route, variation)
         if trajectory is None
         else route_of_poses(read_kitti_poses(trajectory), route, calibration)
     )
+    if imu and (fisheye or rgbd or pairs):
+        raise InputError("--imu: leave out --fisheye, --rgbd and --pairs.")
     for form, given in (("--fisheye", fisheye), ("--rgbd", rgbd)):
         if given and (depth or pairs or verify or fisheye == rgbd):
             raise InputError(
                 f"{form}: leave out --depth, --pairs and --verify, and one of --fisheye and --rgbd."
             )
     ranges = _range("--lateral", lateral, -4.0, 4.0), _range("--heading", heading, 0.0, 45.0)
-    variation = Variation(
-        seed or town.seed, aliased or town.aliased, change or town.change, dynamic or town.moving
-    )
     threads = threads or min(available_cores(), 4)
     with Console(shown=not quiet).render_bar() as on_frame:
         if pairs:
@@ -214,6 +229,8 @@ def synth(
                 threads=threads,
                 on_frame=on_frame,
             )
+    if imu:
+        write_imu(drive, variation.seed, root / "sequences" / route)
     if side_by_side is not None:
         from vslam.datasets.kitti import open_kitti
         from vslam_lab.towns.layouts import write_side_by_side

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from vslam.calibration.files import CALIBRATION
 from vslam.datasets.frames import Source
-from vslam.datasets.tum import CALIBRATION
 from vslam.support.errors import InputError
 from vslam.types.camera import Camera
 from vslam.types.trajectory import Trajectory, write_tum

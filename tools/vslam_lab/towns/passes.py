@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from vslam_lab.towns.render import Light, Moment
+from vslam_lab.towns.rooms import LAMPS, SIZES
 from vslam_lab.towns.routes import CAMERA_HEIGHT, Route
 from vslam_lab.towns.scene import Surfaces, join
 from vslam_lab.towns.shadows import (
@@ -41,7 +42,8 @@ class Passes:
 
     def at(self, frame: int) -> Moment:
         number = int(np.searchsorted(self._starts, frame, side="right")) - 1
-        light, night = self._light(frame, number)
+        inside = self._route.land in SIZES
+        light, night = (LAMPS, 0.0) if inside else self._light(frame, number)
         standing = self._static_surfaces(frame)
         with self._lock:
             if number not in self._shadows:

@@ -172,6 +172,7 @@ def sensor_image(
     yaw_rate: float,
     night: float,
     key: tuple[int, int, int],
+    pitch_rate: float = 0.0,
 ) -> NDArray[np.uint8]:
     """Simulate the lens and the sensor: blur, vignetting, response and noise.
 
@@ -181,14 +182,18 @@ def sensor_image(
         yaw_rate: yaw rate of the camera in rad/s, which causes motion blur.
         night: darkness from 0 to 1, which lengthens the exposure and raises the gain.
         key: seed, frame and side, which determine the noise.
+        pitch_rate: pitch rate of the camera in rad/s, which causes motion blur.
 
     Returns:
         ``(H, W)`` uint8 image.
     """
     image = radiance
-    streak = abs(yaw_rate) * SHUTTER * (1 + 2 * night) * camera.fx
-    if streak > 0.2:
+    exposed = SHUTTER * (1 + 2 * night)
+    streak, fall = abs(yaw_rate) * exposed * camera.fx, pitch_rate * exposed * camera.fy
+    if np.hypot(streak, fall) > 0.2:
         kernel = _streak(streak)[None, :]
+        if fall:
+            kernel = _slanted(streak, float(np.copysign(1.0, yaw_rate)) * fall)
         blurred = cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE)
         image = np.asarray(blurred, np.float32)
     image = np.asarray(cv2.GaussianBlur(image, (0, 0), _BLUR), np.float32)
@@ -208,6 +213,19 @@ def _streak(length: float) -> NDArray[np.float32]:
     at = np.arange(-half, half + 1)
     weight = np.clip(length / 2 + 0.5 - np.abs(at), 0, 1)
     return np.asarray(weight / weight.sum(), np.float32)
+
+
+def _slanted(run: float, rise: float) -> NDArray[np.float32]:
+    """Return the weights of a box filter along a line of ``(run, rise)`` pixels."""
+    half = int(np.ceil(np.hypot(run, rise) / 2 + 1.0))
+    kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
+    for at in np.linspace(-0.5, 0.5, 8 * half + 1):
+        x, y = half + at * run, half + at * rise
+        c, r = int(x), int(y)
+        for dr, wr in ((0, 1 - (y - r)), (1, y - r)):
+            for dc, wc in ((0, 1 - (x - c)), (1, x - c)):
+                kernel[r + dr, c + dc] += wr * wc
+    return np.asarray(kernel / kernel.sum(), np.float32)
 
 
 def _vignette(camera: Camera) -> NDArray[np.float32]:

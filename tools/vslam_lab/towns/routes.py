@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,10 +34,13 @@ class Route:
     Attributes:
         name: name of the route, for example ``demo``.
         about: description in a few words.
-        land: ``town``, ``suburb`` or ``motorway``.
+        land: ``town``, ``suburb`` or ``motorway``; ``room`` or ``hall``, where roads and terrain
+            are not used.
         camera: the stereo rig.
         T_wc: ``(N, 4, 4)`` float64 poses of the left camera in the world frame of the town. The
             heights of the terrain are measured from the plane y = 0 of this frame.
+        rate: frames per second.
+        free: whether the camera moves in six degrees of freedom, so that pitching blurs its images.
     """
 
     name: str
@@ -47,16 +50,26 @@ class Route:
     T_wc: Float
     roads: Roads
     terrain: Terrain
+    rate: float = RATE
+    free: bool = False
 
     @property
     def timestamps(self) -> Float:
-        return np.arange(len(self.T_wc)) / RATE
+        return np.arange(len(self.T_wc)) / self.rate
 
     @property
     def yaw_rate(self) -> Float:
         """Yaw rate of the camera at each frame, ``(N,)`` float64 rad/s."""
         heading = np.unwrap(np.arctan2(self.T_wc[:, 0, 2], self.T_wc[:, 2, 2]))
-        return np.asarray(np.gradient(heading) * RATE)
+        return np.asarray(np.gradient(heading) * self.rate)
+
+    @property
+    def pitch_rate(self) -> Float:
+        """Pitch rate of the camera at each frame, ``(N,)`` float64 rad/s; 0 for a car."""
+        if not self.free:
+            return np.zeros(len(self.T_wc))
+        rise = np.arcsin(np.clip(self.T_wc[:, 1, 2], -1.0, 1.0))
+        return np.asarray(np.gradient(rise) * self.rate)
 
     @property
     def ground_truth(self) -> Float:
@@ -140,14 +153,17 @@ ROUTES = {name: route.about for name, route in _BUILT_IN.items()}
 DRIVES = {"night": "lane+change:1+seed:1"}
 
 
-def built_in_route(name: str) -> Route:
+def built_in_route(name: str, others: Iterable[str] = ()) -> Route:
     """Make one of `ROUTES`.
+
+    Args:
+        others: further known names, for the error message.
 
     Raises:
         InputError: the name is unknown.
     """
     if name not in _BUILT_IN:
-        known = (*ROUTES, *DRIVES)
+        known = (*ROUTES, *others, *DRIVES)
         raise InputError(
             f"synthetic route {name}: unknown{did_you_mean(name, known)}; choose one of "
             f"{', '.join(known)}."

@@ -35,6 +35,7 @@ from vslam_lab.towns.files import (
 )
 from vslam_lab.towns.passes import Passes
 from vslam_lab.towns.render import Renderer, sensor_image
+from vslam_lab.towns.rooms import SIZES, build_room
 from vslam_lab.towns.routes import Route
 from vslam_lab.towns.site import Variation
 from vslam_lab.towns.town import build_town
@@ -223,10 +224,11 @@ def render_frames(
         total: number of frames of the sequence. Frames that are not rendered count as finished.
         monocular: render only the left images.
     """
-    town = build_town(route, variation)
+    inside = route.land in SIZES
+    town = build_room(route.land, variation) if inside else build_town(route, variation)
     passes = Passes(route, town, variation)
     renderer = Renderer(route.camera, town.atlas, town.sky, threads)
-    yaw_rate = route.yaw_rate
+    yaw_rate, pitch_rate = route.yaw_rate, route.pitch_rate
 
     def render(k: int) -> None:
         moment, T_wc = passes.at(k), route.T_wc[k]
@@ -237,6 +239,7 @@ def render_frames(
                 view.image,
                 route.camera,
                 yaw_rate=float(yaw_rate[k]),
+                pitch_rate=float(pitch_rate[k]),
                 night=moment.night,
                 key=(variation.seed, k, side),
             )

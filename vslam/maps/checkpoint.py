@@ -39,6 +39,7 @@ CHECKPOINTS = Codec(
         "Track.shift": ("N", 2),
         "Track.visible": ("V",),
         "Track.twist": (6,),
+        "GravityDirection.direction": (3,),
         "Pyramid.pixels": ("Q",),
         "Pyramid.offsets": ("L",),
         "Pyramid.shapes": ("L", 2),

@@ -9,7 +9,8 @@ import pytest
 from inertial import ADIS16448, EUROC, Flight, recording
 from scipy.spatial.transform import Rotation
 
-from vslam.run.imu_checks import Check, align, check_alignment, check_samples
+from vslam.run.imu_alignment import align
+from vslam.run.imu_checks import Check, check_alignment, check_samples
 from vslam.types.imu import GRAVITY
 
 DEGREE = np.pi / 180.0

@@ -103,7 +103,7 @@ def read_calibration(files: Sequence[Path | str], size: Size | None = None) -> C
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Write the calibration of a camera or of a stereo pair, with its IMU, in vslam's own format.
+    """Write a calibration in vslam's own format.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -113,6 +113,11 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
         lines += ["right:", *_camera_lines(calibration.right)]
         lines += ["T_left_right:  # maps points of the right camera to the left one; metres"]
         lines += [f"  - {row}" for row in calibration.T_left_right.tolist()]
+        if calibration.right_delay:
+            lines.append(f"right_delay: {calibration.right_delay!r}  # seconds")
+    for key in ("depth_scale", "virtual_baseline"):
+        if (value := getattr(calibration, key)) is not None:
+            lines.append(f"{key}: {value!r}")
     lines += _imu_lines(calibration)
     write_file(path, "\n".join(lines) + "\n", "give another file with --out")
 

@@ -153,7 +153,7 @@ def _checked(T: Array, source: str, key: str) -> Array:
     if not T[:3].any():
         raise InputError(
             f"{where} is all zeros, as in devices that were never calibrated; measure it with "
-            "Kalibr (docs/howto/imu.md), or leave the IMU out with --no-imu."
+            "vslam calibrate --imu (docs/howto/imu.md), or leave the IMU out with --no-imu."
         )
     try:
         rigid = ImuCalibration(T).T_imu_camera

@@ -5,15 +5,17 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from itertools import count
+from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
 import typer
 
 from vslam.cli.console import Console
-from vslam.cli.options import option, reads_source
+from vslam.cli.options import flag, open_given, option, reads_source, require_data
 from vslam.support.errors import BrokenSourceError, InputError, ResultsError
 from vslam.support.options import METHOD, OUTPUT
+from vslam.types.source_options import LIVE
 
 if TYPE_CHECKING:
     from vslam.calibration.boards import Board
@@ -27,15 +29,18 @@ _EXAMPLES = """
   vslam calibrate board.mp4 --board checkerboard --size 9x6 --square 0.025
   vslam calibrate pair.mkv --side-by-side --board charuco --size 7x5 --square 0.04 --marker 0.03
   vslam calibrate cam_april/mav0 --board april_6x6.yaml --lens fisheye --out stereo.yaml
+  vslam calibrate drive.mp4 --imu --side-by-side --calib stereo.yaml
 """
 _MOST_SEARCHED = 300  # images, which are spread evenly over the source; this takes 1 to 2 minutes
+_OF_DRIVES = ("calib", "depth", "depth_scale", "mask", "imu_topics")  # options with --imu
+_DEFAULT_OUT = Path("calibration.yaml")
 _EXAMINED = 10  # images in which other boards are searched for if the given board is not found
 
 app = typer.Typer()
 
 
 @app.command(epilog=_EXAMPLES)
-@reads_source(without=("calib", "depth", "depth_scale", "mask", "imu", "imu_topics"))
+@reads_source(without=("imu",))
 def calibrate(
     given: SourceOptions,
     board: Annotated[
@@ -45,7 +50,7 @@ def calibrate(
             "KIND|FILE",
             "Kind of board: checkerboard, charuco, aprilgrid, or a target file of Kalibr.",
         ),
-    ],
+    ] = "",
     size: Annotated[
         str,
         option(
@@ -86,19 +91,36 @@ def calibrate(
         ),
     ] = "pinhole",
     out: Annotated[
-        Path,
+        Path | None,
         option(
             OUTPUT,
             "FILE",
-            "Calibration file to write. A page of residuals is written next to it. Existing files "
-            "are renamed.",
+            "Calibration file to write. For a board, a page of residuals is written next to it. "
+            "Existing files are renamed.",
+            unset="calibration.yaml; with --imu, the file of --calib if it has this format",
         ),
-    ] = Path("calibration.yaml"),
+    ] = None,
+    imu: Annotated[
+        bool,
+        flag(
+            METHOD,
+            "Measure from a drive how the IMU is turned against the camera, and how its clock "
+            "differs.",
+            "--imu",
+        ),
+    ] = False,
 ) -> None:
-    """Calibrate a camera or a stereo pair from images of a calibration board.
+    """Calibrate a camera or a stereo pair from images of a calibration board, or an IMU from a
+    drive in which the camera turns about all axes.
 
     The exit code is 1 if the calibration has faults.
     """
+    if imu:
+        of_board = {"--board": board, "--size": size, "--square": square, "--marker": marker}
+        for name in filter(of_board.get, of_board):
+            raise InputError(f"{name}: an IMU is calibrated without a board; leave it out.")
+        _calibrate_imu(given, out)
+        return
     from vslam.calibration.boards import other_board
     from vslam.calibration.files import write_calibration
     from vslam.calibration.solve import estimate
@@ -106,8 +128,14 @@ def calibrate(
     from vslam.doctor.calibration_page import findings_of, write_page
     from vslam.doctor.findings import lines
 
+    for name in _OF_DRIVES:
+        if getattr(given, name) not in (None, "", ()):
+            raise InputError(f"--{name.replace('_', '-')}: only with --imu; leave it out.")
+    if not board:
+        raise InputError("--board is missing: give a board, or --imu to calibrate an IMU.")
     if given.sensor == "rgbd":
         raise InputError("--sensor rgbd: depth cameras cannot be calibrated; give mono or stereo.")
+    out = out or _DEFAULT_OUT
     _check_place(out)
     raw = open_raw(given)
     if raw.live and given.max_frames is None:
@@ -145,14 +173,62 @@ def calibrate(
         typer.echo(f"  vslam {command} DRIVE{options} --calib {shlex.quote(str(out))}")
 
 
-def _check_place(out: Path) -> None:
+def _calibrate_imu(given: SourceOptions, out: Path | None) -> None:
+    from vslam.calibration.files import write_calibration
+    from vslam.config import Config
+    from vslam.datasets.frames import first_frames
+    from vslam.doctor.imu_calibration import MOST_FRAMES, measure_imu
+    from vslam.run.imu_checks import rotation_text
+
+    require_data(given)
+    if given.dataset in LIVE:
+        raise InputError(f"--dataset {given.dataset}: record a drive, and calibrate its IMU.")
+    source = first_frames(open_given(given, Console(shown=True)), MOST_FRAMES)
+    used = Path("" if source.calibration is None else source.calibration.source)
+    out = out or (used if _is_own(used) else _DEFAULT_OUT)
+    _check_place(out)
+    found = measure_imu(source, Config())
+    alignment, new = found.alignment, found.new.imu
+    assert new is not None
+    typer.echo(
+        f"measured: rotation {rotation_text(alignment.R_imu_camera)}, standard deviation "
+        f"{degrees(alignment.rotation_sigma):.2f} degrees"
+    )
+    typer.echo(
+        f"measured: time_offset {1e3 * alignment.time_offset:+.2f} ms, standard deviation "
+        f"{1e3 * alignment.sigma:.2f} ms"
+    )
+    for name, one in (("old", found.old), ("new", new)):
+        if one is not None:
+            typer.echo(f"{name}: T_imu_camera {rotation_text(one.T_imu_camera)}")
+            typer.echo(f"{name}: time_offset {1e3 * one.time_offset:+.2f} ms")
+    if not found.replaced:
+        typer.echo("The calibration agrees with the measurement, so nothing is written.")
+        return
+    _keep_earlier(out)
+    write_calibration(out, found.new)
+    typer.echo(f"{out}: new {' and '.join(found.replaced)}.")
+    if not new.T_imu_camera[:3, 3].any():
+        typer.echo(
+            "The translation is 0, because rotations do not show it; write the position of the "
+            "camera in the frame of the IMU into the last column of T_imu_camera, in metres."
+        )
+
+
+def _is_own(file: Path) -> bool:
+    """Return whether a file is a calibration in vslam's own format, in YAML."""
     from vslam.calibration.documents import read_document
+
+    return file.suffix in (".yaml", ".yml") and file.is_file() and "left" in read_document(file)
+
+
+def _check_place(out: Path) -> None:
     from vslam.maps.new_output import require_place
 
     require_place(out, "--out")
     if out.suffix not in (".yaml", ".yml"):
         raise InputError(f"--out {out}: a calibration is YAML; give a name that ends in .yaml.")
-    if out.exists() and "left" not in read_document(out):
+    if out.exists() and not _is_own(out):
         raise InputError(f"--out {out}: belongs to another program; give another name.")
 
 

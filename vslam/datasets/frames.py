@@ -20,6 +20,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.calibration.models import Calibration
 from vslam.datasets.association import Pairing
 from vslam.datasets.imu import Imu
 from vslam.datasets.times import Timing, in_order
@@ -163,6 +164,8 @@ class Source(_Frames):
         warnings: what the report of a run must say about the data, in sentences.
         imu: the IMU on the camera; None if there is none. Its calibration refers to the left camera
             of ``camera``.
+        calibration: calibration of the images before rectification; None if the reader takes no
+            calibration file.
         rectify_mask: function that rectifies an ``(H, W)`` uint8 mask of the original left images.
             None if vslam does not rectify the images.
         world: name of the world frame of the ground truth, which all drives along a rendered route
@@ -175,6 +178,7 @@ class Source(_Frames):
 
     camera: Camera
     world: str = ""
+    calibration: Calibration | None = None
     rectify_mask: Callable[[Image], Image] | None = None
 
 
@@ -286,8 +290,8 @@ def frames_at(source: Source, indices: Several[int]) -> Iterator[TimedFrame]:
     yield from (frame for k, frame in enumerate(played) if k in wanted)
 
 
-def first_frames(source: Source) -> Source:
-    """Load the first frames of a stream into memory, so that they can be read in any order.
+def first_frames(source: Source, n: int = FIRST_FRAMES) -> Source:
+    """Load the first ``n`` frames of a stream into memory, so that they can be read in any order.
 
     A source whose frames are stored is returned unchanged. If a frame cannot be decoded, the error
     is raised only when this frame is read.
@@ -300,7 +304,7 @@ def first_frames(source: Source) -> Source:
     frames = []
     problem = "it has no frames"
     try:
-        for frame in islice(source.frames(), FIRST_FRAMES):
+        for frame in islice(source.frames(), n):
             frames.append(_preloaded(frame))
     except BrokenSourceError as error:
         problem = str(error).rstrip(".")

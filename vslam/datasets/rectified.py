@@ -54,6 +54,7 @@ def rectified(raw: RawSource, calibration: Calibration) -> Source:
         pairing=raw.pairing,
         timing=raw.timing,
         warnings=raw.warnings,
+        calibration=calibration,
         rectify_mask=rectification.left_depth,
         imu=None if raw.imu is None else _rectified_imu(raw.imu, calibration, rectification),
     )

@@ -10,17 +10,15 @@ from numpy.typing import NDArray
 from vslam.config import Config
 from vslam.datasets.frames import Source
 from vslam.doctor.findings import Finding
-from vslam.run.imu_checks import Alignment, Check, align, check_alignment, check_samples
+from vslam.run.imu_alignment import Alignment, align
+from vslam.run.imu_checks import Check, check_alignment, check_samples
 from vslam.slam import Slam
 from vslam.support.errors import InputError, UnreadableImageError
 from vslam.types.features import TrackingState
 from vslam.types.geometry import Matrix
 
 _LONGEST_S, _MOST_FRAMES = 8.0, 160  # images that are tracked
-_PLACE = (
-    "add the section imu with T_imu_camera to the calibration; Kalibr measures it and time_offset "
-    "(docs/howto/imu.md)"
-)
+_PLACE = "measure T_imu_camera with vslam calibrate --imu, or add it (docs/howto/imu.md)"
 
 
 def examine_imu(source: Source, config: Config) -> list[Finding]:
@@ -49,8 +47,13 @@ def examine_imu(source: Source, config: Config) -> list[Finding]:
     return [_finding(check) for check in checks]
 
 
-def measure_alignment(source: Source, config: Config) -> Alignment | None:
+def measure_alignment(
+    source: Source, config: Config, longest_s: float = _LONGEST_S, most_frames: int = _MOST_FRAMES
+) -> Alignment | None:
     """Track the part of a source in which its IMU turns most, and compare the rotations.
+
+    Args:
+        longest_s, most_frames: limits of the length of that part.
 
     Returns:
         None if the camera hardly turns or cannot be tracked.
@@ -64,15 +67,17 @@ def measure_alignment(source: Source, config: Config) -> Alignment | None:
     samples = imu.recorded.samples
     times = source.timestamps
     offset = 0.0 if imu.calibration is None else imu.calibration.time_offset
-    chosen = _liveliest(times + offset, samples)
+    chosen = _liveliest(times + offset, samples, longest_s, most_frames)
     rotations = _track(source, chosen, config)
     return align(times[chosen], rotations, samples)
 
 
-def _liveliest(times: NDArray[np.float64], samples: Matrix) -> slice:
+def _liveliest(
+    times: NDArray[np.float64], samples: Matrix, longest_s: float, most_frames: int
+) -> slice:
     """Return the frames of a few seconds in which the rates of the gyroscope change most."""
     interval = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-    n = min(len(times), _MOST_FRAMES, max(2, round(_LONGEST_S / interval)))
+    n = min(len(times), most_frames, max(2, round(longest_s / interval)))
     best, begin = -1.0, 0
     for first in range(0, len(times) - n + 1, max(1, n // 4)):
         inside = (samples[:, 0] >= times[first]) & (samples[:, 0] <= times[first + n - 1])

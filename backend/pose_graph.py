@@ -258,12 +258,6 @@ def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     return np.array([first_of(node) for node in range(n)], np.int64)
 
 
-def load_optimiser() -> None:
-    """Import GTSAM in advance. The import takes a tenth of a second, which would delay the frames
-    of a live camera during the first loop closure."""
-    import gtsam  # noqa: F401
-
-
 def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     """Find the ``(N, 4, 4)`` poses ``T_cw`` that agree best with the edges, using
     Levenberg-Marquardt.

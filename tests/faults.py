@@ -134,7 +134,7 @@ POINTS = (
     Point("result: report.md", "vslam.report.render.markdown", 1, MISSING, ("report.md",)),
     Point("result: page", "vslam.report.render.html", 1, MISSING, ("report.html",)),
     Point("result: explorer", "vslam.report.explorer.explorer_data", 1, MISSING, ("report.html",)),
-    Point("warm-up of the kernels", "vslam.run.warmup.compile_kernels", 1, REFUSED),
+    Point("warm-up of the kernels", "vslam.run.warmup.Compilation.finish", 1, REFUSED),
     Point("run.json", "vslam.run.options.write_options", 1, REFUSED),
 )  # fmt: skip
 

@@ -477,7 +477,7 @@ def pipeline(monkeypatch) -> SimpleNamespace:
     monkeypatch.setattr(recorder, "SeveralRecorders", lambda recorders: recorders[1])
     monkeypatch.setattr(figures, "draw_figures", draw_figures)
     monkeypatch.setattr(warmup, "is_cold", lambda: False)
-    monkeypatch.setattr(warmup, "compile_kernels", lambda processes, load: None)
+    monkeypatch.setattr(warmup.Compilation, "finish", lambda self: None)
     return calls
 
 

@@ -101,7 +101,7 @@ STARTED = {
     ("vslam_lab.bench.execute", "vslam_lab.cli.child"),
     ("vslam_lab.cli.cells", "vslam_lab.cli.child"),
     ("vslam_lab.loopbench.cost", "vslam_lab.loopbench.cost"),
-    ("vslam.run.warmup", "vslam.run.warmup"),
+    ("vslam.run.warmup", "vslam.run.toy_room"),
 }
 ONLY_IN = {
     "torch": "vslam_lab.training",

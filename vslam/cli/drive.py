@@ -12,6 +12,7 @@ import typer
 
 from vslam.cli.console import Console
 from vslam.cli.options import open_given
+from vslam.run.warmup import Compilation
 from vslam.support.errors import InputError, ResultsError
 
 if TYPE_CHECKING:
@@ -54,8 +55,19 @@ def drive(
     """
     if options.localize and output.save_map is not None:
         raise InputError("--save-map: localising does not change the map; leave it out.")
-    console = Console(shown=not output.quiet)
-    source, perturbation = _open(options, console)
+    with Compilation() as kernels:
+        _drive(options, output, out, resume, Console(shown=not output.quiet), kernels)
+
+
+def _drive(
+    options: RunOptions,
+    output: Output,
+    out: Path,
+    resume: Path | None,
+    console: Console,
+    kernels: Compilation,
+) -> None:
+    source, perturbation = _open(options, console, kernels)
     _refuse_live_source(source, resume)
     fixes = None if options.gps is None else _fixes(options.gps, options.gps_antenna, source)
 
@@ -72,7 +84,7 @@ def drive(
     settings = options.model_copy(update=effective)
     with ExitStack() as lock:
         unfinished = _unfinished(options, source, resume, lock)
-        _compile(settings, console)
+        _compile(settings, console, kernels)
         run = begin(source, settings, unfinished)
         viewer = _viewer(output, console)
         if unfinished is not None:
@@ -117,11 +129,13 @@ def drive(
         raise typer.Exit(1)
 
 
-def _open(options: RunOptions, console: Console) -> tuple[Source, Perturbation]:
+def _open(
+    options: RunOptions, console: Console, kernels: Compilation
+) -> tuple[Source, Perturbation]:
     from vslam.datasets.perturbation import parse_perturbation
 
     perturbation = parse_perturbation(options.perturb, options.seed)
-    source = open_given(options, console)
+    source = open_given(options, console, kernels.start)
     perturbation.bound_to(source)
     return source, perturbation
 
@@ -189,12 +203,16 @@ def _viewer(output: Output, console: Console) -> Viewer | None:
     return viewer
 
 
-def _compile(settings: RunOptions, console: Console) -> None:
-    from vslam.run.warmup import compile_kernels, is_cold
+def _compile(settings: RunOptions, console: Console, kernels: Compilation) -> None:
+    from vslam.run.warmup import is_cold
 
     if is_cold():
         console.announce("first run: compiling the kernels, about a minute ...")
-    compile_kernels(processes=min(settings.threads, 2), load=settings.realtime)
+    kernels.finish()
+    if settings.realtime:  # no frame may wait until its kernels are loaded
+        from vslam.run.toy_room import call_kernels
+
+        call_kernels()
 
 
 def _new_folder(

@@ -165,12 +165,11 @@ class Cells:
 
             return run_on_cluster(cells, self.options, self.scheduler, self.out)
         from vslam.run.warmup import compile_kernels, is_cold
-        from vslam.support.machine import available_cores
         from vslam_lab.bench.execute import run_here
 
         if cells and is_cold():  # compiled once here, not in each run
             self.console.announce("first run: compiling the kernels, about a minute ...")
-            compile_kernels(processes=min(available_cores(), 2))
+            compile_kernels()
         return run_here(cells, self.options, self.jobs, self.out)
 
 

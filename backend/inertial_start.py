@@ -4,7 +4,7 @@ All are found from 0.5 to 1 s of poses by linear least squares, with the length 
 (Qin and Shen, "Robust initialization of monocular visual-inertial estimation", IROS 2017; here with
 one velocity, because samples are integrated from the first pose to every other one). The stretch
 need not contain a certain motion, unless the scale is unknown: also at rest, poses and samples tell
-how the camera is tilted.
+how the camera is tilted. The scale takes a few seconds in which the camera accelerates.
 
 In the frame of the first pose, with the preintegrated position ``d(t)`` and its derivative
 ``D(t)`` by the bias ``b`` of the accelerometer, the position of the IMU is
@@ -12,13 +12,18 @@ In the frame of the first pose, with the preintegrated position ``d(t)`` and its
     s c(t) + R(t) l = p + v t + g t^2 / 2 + R(0) (d(t) + D(t) b)
 
 with the position ``c`` of the camera in units of the map, the scale ``s`` in metres per unit, and
-the lever arm ``l`` from the camera to the IMU in the frame of the camera. Poses have white noise.
-The noise of the samples is integrated, so the errors of all positions are correlated. Both are the
-same along each axis, which leaves one N x N covariance for N poses.
+the lever arm ``l`` from the camera to the IMU in the frame of the camera. Both sides are divided by
+``s``, and ``1 / s`` is the unknown. With ``s`` as the unknown, its factor ``c`` would have noise,
+and least squares finds factors of noisy quantities too small (attenuation; Fuller, "Measurement
+Error Models", 1987, section 1.1): a walk of 2 s gave half the true scale.
+
+Poses have white noise. The noise of the samples is integrated, so the errors of all positions are
+correlated. Both are the same along each axis, which leaves one N x N covariance for N poses.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,7 +52,8 @@ GYRO_BIAS, ACCEL_BIAS = 0.1, 0.2
 _TURN, _PLACE, _SPEED, _FALL = 0.1, 1.0, 1.0, 0.1  # rad, m, m/s, rad
 LONGEST_GAP = 0.03  # s without a sample, above which a stretch is not used
 # A result is refused if the largest standard deviation of the velocity (m/s) or that of the
-# logarithm of the scale is larger. ORB-SLAM3's start waits for motion instead.
+# logarithm of the scale is larger. ORB-SLAM3's start waits for motion instead. Poses that fit worse
+# than expected make the scale as much less certain.
 MAX_SPEED_SIGMA, MAX_SCALE_SIGMA = 0.1, 0.02
 # Largest ratio of the sum of squared errors to its expectation. Poses that images gave have errors
 # that are not independent, so the limit is far above that of independent errors.
@@ -95,7 +101,8 @@ class GravityState:
     Attributes:
         state: at the last pose, in the world frame of the poses, in metres.
         scale: metres per unit of the poses; 1 if it was known.
-        scale_sigma: standard deviation of the logarithm of the scale; 0 if it was known.
+        scale_sigma: standard deviation of the logarithm of the scale, multiplied by the root of
+            ``misfit`` if that is above 1; 0 if the scale was known.
         speed_sigma: largest standard deviation of the velocity, in m/s.
         condition: condition number of the least squares, whose unknowns are in units of their
             expected sizes.
@@ -163,13 +170,14 @@ def find_gravity(
     """Find gravity, velocity, biases and, if needed, the scale from a stretch of poses.
 
     Args:
-        stretch: poses over 0.5 to 2 s, in a world frame that does not jump.
+        stretch: poses over 0.5 to 2 s, or 2 to 8 s if the scale is unknown, in a world frame that
+            does not jump.
         samples: ``(M, 7)``, see ``vslam/types/imu.py``.
         known_scale: whether the poses are in metres.
 
     Returns:
-        The result, which ``doubt`` may refuse. None if there are fewer than five poses, or samples
-        are missing for more than ``LONGEST_GAP`` seconds.
+        The result, which ``doubt`` may refuse. None if there are fewer than five poses, samples
+        are missing for more than ``LONGEST_GAP`` seconds, or no positive scale fits.
     """
     if len(stretch.times) < 5:
         return None
@@ -181,22 +189,23 @@ def find_gravity(
     if motions is None:
         return None
     line = _fit(stretch, motions, calibration, known_scale=known_scale)
+    if line is None:
+        return None
     scaled = stretch.T_world_camera.copy()
     scaled[:, :3, 3] *= line.scale
     metric = replace(stretch, T_world_camera=scaled, sigma_m=stretch.sigma_m * line.scale)
     state, filter_misfit = _filtered(metric, samples, calibration, line, bias)
     speed_sigma = float(np.sqrt(np.linalg.eigvalsh(state.covariance[SPEED, SPEED])[-1]))
     misfit = max(line.misfit, gyro.misfit, filter_misfit)
+    scale_sigma = line.scale_sigma * max(misfit, 1.0) ** 0.5
     doubt = ""
-    if line.scale <= 0.0 or line.scale_sigma > MAX_SCALE_SIGMA:
+    if not scale_sigma <= MAX_SCALE_SIGMA:
         doubt = "the motion does not tell the scale yet"
     elif not (np.isfinite(misfit) and misfit <= MAX_MISFIT):
         doubt = "poses and inertial samples do not agree"
     elif speed_sigma > MAX_SPEED_SIGMA:
         doubt = "the velocity is not certain yet"
-    return GravityState(
-        state, line.scale, line.scale_sigma, speed_sigma, line.condition, misfit, doubt
-    )
+    return GravityState(state, line.scale, scale_sigma, speed_sigma, line.condition, misfit, doubt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,8 +228,9 @@ def _fit(
     calibration: ImuCalibration,
     *,
     known_scale: bool,
-) -> _Fit:
-    """Fit the positions of all poses, see the top of this module."""
+) -> _Fit | None:
+    """Fit the positions of all poses, see the top of this module. None if the scale is not
+    positive."""
     T_wc, times = stretch.T_world_camera, stretch.times - stretch.times[0]
     T_wi = _imu_poses(stretch, calibration)
     R, n = T_wi[0, :3, :3], len(times)
@@ -229,38 +239,36 @@ def _fit(
     arm = T_wi[:, :3, 3] - T_wc[:, :3, 3]
     d = np.array([R @ motion.position for motion in motions])
     D = np.array([R @ motion.by_bias[6:, 3:] for motion in motions])
-    gravity = _mean_force_down(R, motions[-1])
-    scale = 1.0
-    x: Matrix = np.zeros(12)
-    L: Matrix = np.eye(n)
+    gravity, unit = _mean_force_down(R, motions[-1]), 1.0
     for _ in range(_ITERATIONS):
-        sigma = stretch.sigma_m * (1.0 if known_scale else abs(scale))
-        L = np.linalg.cholesky(_position_covariance(times, sigma, calibration)).astype(np.float64)
+        C = _position_covariance(times, stretch.sigma_m / unit, calibration) * unit**2
+        L: Matrix = np.linalg.cholesky(C).astype(np.float64)
         B = _tangent(gravity)  # gravity changes by B w, which keeps its length to first order
         A = np.zeros((n, 3, 12))
         A[:, :, 0:3] = np.eye(3)
         A[:, :, 3:6] = times[:, None, None] * np.eye(3)
         A[:, :, 6:8] = 0.5 * times[:, None, None] ** 2 * B
         A[:, :, 8:11] = D
-        A[:, :, 11] = -c
-        y = arm - d - 0.5 * times[:, None] ** 2 * gravity + (c if known_scale else 0.0)
-        A, y = _whitened(L, A, y)
-        prior = np.zeros(12)
-        prior[8:11] = ACCEL_BIAS**-2
-        prior[11] = 1e24 if known_scale else 0.0
+        A[:, :, 11] = 0.5 * times[:, None] ** 2 * gravity + d - arm
+        A, y = _whitened(L, A, c)
+        if known_scale:
+            A, y = A[:, :11], y - A[:, 11]
+        prior = np.zeros(A.shape[1])
+        prior[8:11] = (unit * ACCEL_BIAS) ** -2
         H = A.T @ A + np.diag(prior)
         x = np.linalg.solve(H, A.T @ y).astype(np.float64)
-        gravity = gravity + B @ x[6:8]
+        unit = 1.0 if known_scale else float(x[11])
+        if not unit > 0.0:
+            return None
+        gravity = gravity + B @ x[6:8] / unit
         gravity *= GRAVITY / np.linalg.norm(gravity)
-        scale = 1.0 if known_scale else float(x[11])
-    expected = np.repeat([1.0, 1.0, GRAVITY, 1.0, 1.0], [3, 3, 2, 3, 1])
-    free = slice(0, 11 if known_scale else 12)
-    sized = (H * np.outer(expected, expected))[free, free]
+    expected = np.repeat([1.0, 1.0, GRAVITY, 1.0, 1.0], [3, 3, 2, 3, 1])[: len(x)]
+    sized = H * np.outer(expected, expected)
     misfit = float(np.sum((y - A @ x) ** 2) / max(3 * n - 8, 1))
-    sigma = 0.0 if known_scale else float(np.sqrt(np.linalg.inv(H)[11, 11]) / abs(scale))
+    sigma = 0.0 if known_scale else float(np.sqrt(np.linalg.inv(H)[11, 11]) / unit)
     condition = float(np.linalg.cond(sized))
-    p = x[:3] + scale * origin
-    return _Fit(p, x[3:6], gravity, x[8:11], scale, sigma, condition, misfit)
+    p = (x[:3] + origin) / unit
+    return _Fit(p, x[3:6] / unit, gravity, x[8:11] / unit, 1.0 / unit, sigma, condition, misfit)
 
 
 def _filtered(
@@ -308,7 +316,9 @@ def _motions(
     if not len(samples):
         return None
     times, noise = stretch.times, inflated(calibration.noise)
-    motions = [preintegrate(samples, float(times[0]), float(time), noise, bias) for time in times]
+    motions = [preintegrate(samples, float(times[0]), float(times[0]), noise, bias)]
+    for before, now in itertools.pairwise(times.tolist()):
+        motions.append(motions[-1].followed_by(preintegrate(samples, before, now, noise, bias)))
     return None if motions[-1].longest_gap > LONGEST_GAP else motions
 
 

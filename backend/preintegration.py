@@ -76,6 +76,31 @@ class Preintegration:
             self.longest_gap,
         )
 
+    def followed_by(self, after: Preintegration) -> Preintegration:
+        """Return this motion and the one that begins where it ends as one motion.
+
+        Args:
+            after: a motion from which the same biases were subtracted.
+        """
+        R, t = self.rotation, after.seconds
+        F = np.eye(9)  # from the errors of this motion to those of both
+        F[:3, :3] = after.rotation.T
+        F[3:6, :3] = -R @ cross_matrix(after.velocity)
+        F[6:, :3] = -R @ cross_matrix(after.position)
+        F[6:, 3:6] = t * np.eye(3)
+        G = np.eye(9)
+        G[3:6, 3:6] = G[6:, 6:] = R
+        return Preintegration(
+            self.seconds + t,
+            R @ after.rotation,
+            self.velocity + R @ after.velocity,
+            self.position + t * self.velocity + R @ after.position,
+            self.bias,
+            F @ self.by_bias + G @ after.by_bias,
+            F @ self.covariance @ F.T + G @ after.covariance @ G.T,
+            max(self.longest_gap, after.longest_gap),
+        )
+
 
 def preintegrate(
     samples: Matrix, start: float, end: float, noise: ImuNoise, bias: Matrix = NO_BIAS

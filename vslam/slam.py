@@ -21,7 +21,7 @@ from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.method.gaps import Gap, find_gaps
 from vslam.method.hypotheses import map_gravity
-from vslam.method.inertia import IMU_REFUSED, is_refused
+from vslam.method.inertia import IMU_REFUSED, SCALE_UNKNOWN, is_refused
 from vslam.method.map_frames import in_first_part, keyframe_trajectory
 from vslam.method.session import Session
 from vslam.support.errors import InputError
@@ -45,7 +45,8 @@ def _as_mounted(trajectory: Trajectory, camera: Camera) -> Trajectory:
 
 
 class Slam:
-    """Stereo, RGB-D or monocular SLAM. A monocular map has an arbitrary unit instead of metres.
+    """Stereo, RGB-D or monocular SLAM. A monocular map has an arbitrary unit instead of metres,
+    until an IMU tells its scale.
 
     >>> slam = Slam(camera)
     >>> for left, right, timestamp in frames:
@@ -100,8 +101,7 @@ class Slam:
                 The poses equal those of an uninterrupted drive only if the map was saved with
                 ``resumable=True``.
             imu: where the IMU is on the rectified left camera, and its noise. Its samples are
-                passed to ``step`` or ``add_imu``. They are used only if the camera measures depth.
-                None if there is no IMU.
+                passed to ``step`` or ``add_imu``. None if there is no IMU.
 
         Raises:
             ValueError: the map cannot be continued. The message gives the reason in a few words.
@@ -115,7 +115,7 @@ class Slam:
         self.workers = Workers(threads)
         self._session = Session(
             context, detector, images, self.workers, start,
-            localize=localize, resume=resume, imu=None if camera.monocular else imu,
+            localize=localize, resume=resume, imu=imu,
         )  # fmt: skip
         self.rig = self._session.rig
 
@@ -350,8 +350,17 @@ class Slam:
         Such failures are a failed search for loops, a failed global bundle adjustment, and a right
         image that could not be read.
         """
-        refused = [IMU_REFUSED] if is_refused(self._session.inertia) else []
-        return [*self._session.closing.problems, *self.rig.problems, *refused]
+        of_imu = [IMU_REFUSED] if is_refused(self._session.inertia) else []
+        if self._session.lacks_scale:
+            of_imu.append(SCALE_UNKNOWN)
+        return [*self._session.closing.problems, *self.rig.problems, *of_imu]
+
+    @property
+    def metric_since(self) -> float | None:
+        """Time in seconds since when an IMU has made a monocular map metric. The whole map is then
+        scaled. None for other maps."""
+        since = self._session.inertia.metric_since
+        return since if since >= 0.0 else None
 
     @property
     def corrections(self) -> list[LoopCorrection]:

@@ -113,6 +113,20 @@ def test_one_camera_gets_its_scale_when_the_motion_tells_it():
     assert np.linalg.norm(found.state.velocity - flight.velocity(3.2)) < 0.15
 
 
+def test_the_noise_of_poses_does_not_make_the_scale_too_small():
+    """In slow motion, noise of the poses is a large part of what least squares sees."""
+    errors, squares = [], []
+    for seed in range(40):
+        flight = Flight(seed, speed=0.3, turning=0.3)
+        stretch = stretch_of(flight, 0.2, 2.0, (0.004, 0.0005), seed, scale=2.5)
+        samples = samples_of(flight, noise=MOVING, seed=seed)
+        found = find_gravity(stretch, samples, CALIBRATION, known_scale=False)
+        errors.append(np.log(found.scale / 2.5))
+        squares.append((errors[-1] / found.scale_sigma) ** 2)
+    assert abs(np.mean(errors)) < 0.015
+    assert 0.4 < np.mean(squares) < 1.5
+
+
 def test_without_motion_one_camera_has_no_scale_and_no_error():
     flight = Flight(3, speed=0.0, turning=0.0)
     found = find_gravity(

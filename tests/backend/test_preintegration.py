@@ -79,14 +79,13 @@ def test_the_ends_are_interpolated_so_that_parts_compose_to_the_whole():
     middle = 0.41234  # between two samples
     whole = preintegrate(samples, 0.1013, 0.8871, NOISE)
     first = preintegrate(samples, 0.1013, middle, NOISE)
-    second = preintegrate(samples, middle, 0.8871, NOISE)
-    t = second.seconds
-    R = first.rotation @ second.rotation
-    v = first.velocity + first.rotation @ second.velocity
-    p = first.position + first.velocity * t + first.rotation @ second.position
-    assert np.abs(so3_log(whole.rotation.T @ R)).max() < 1e-7
-    assert np.abs(whole.velocity - v).max() < 2e-6
-    assert np.abs(whole.position - p).max() < 2e-6
+    both = first.followed_by(preintegrate(samples, middle, 0.8871, NOISE))
+    assert both.seconds == pytest.approx(whole.seconds)
+    assert np.abs(so3_log(whole.rotation.T @ both.rotation)).max() < 1e-7
+    assert np.abs(whole.velocity - both.velocity).max() < 2e-6
+    assert np.abs(whole.position - both.position).max() < 2e-6
+    assert np.allclose(both.by_bias, whole.by_bias, atol=1e-5)
+    assert np.allclose(both.covariance, whole.covariance, rtol=1e-3, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from vslam.cli.options import AlignmentName
 from vslam.support.errors import InputError
+
+if TYPE_CHECKING:
+    from vslam.report.schema import ReportJson
 
 _EXAMPLES = """
 [b]Examples[/b]
@@ -43,7 +46,7 @@ def evaluate_files(
         typer.Option(
             metavar="se3|sim3|none",
             help="Alignment with the ground truth. [b]sim3[/b] also fits the scale.",
-            show_default="sim3 for a monocular run, otherwise se3",
+            show_default="sim3 for a monocular run without an IMU, otherwise se3",
         ),
     ] = None,
     times: Annotated[
@@ -75,8 +78,9 @@ def evaluate_files(
     alignment: str = align or "se3"
     sensor = None
     if estimate.is_dir():
-        estimate, gt, sensor = _files_of_run(estimate, gt, times)
-        alignment = align or alignment_of(sensor)
+        estimate, gt, report = _files_of_run(estimate, gt, times)
+        sensor, metric = report.sensor, report.metric_since_s is not None
+        alignment = align or alignment_of(sensor, metric=metric)
     elif gt is None:
         raise InputError(
             f"{estimate}: give its ground truth with --gt, or give the folder of a run that has "
@@ -112,8 +116,10 @@ def evaluate_files(
     show_sections([Section("", [*alerts, Pairs(rows)])])
 
 
-def _files_of_run(folder: Path, gt: Path | None, times: Path | None) -> tuple[Path, Path, str]:
-    """Return the files of the trajectory and of the ground truth of a run, and its sensor."""
+def _files_of_run(
+    folder: Path, gt: Path | None, times: Path | None
+) -> tuple[Path, Path, ReportJson]:
+    """Return the files of the trajectory and of the ground truth of a run, and its report."""
     from vslam.report.schema import ReportJson
     from vslam.types.trajectory import trajectory_format
 
@@ -124,4 +130,4 @@ def _files_of_run(folder: Path, gt: Path | None, times: Path | None) -> tuple[Pa
         raise InputError(f"{folder}: this run had no ground truth; give one with --gt.")
     with_times = times is not None or trajectory_format(gt) != "kitti"
     name = "trajectory.tum" if with_times else "trajectory_kitti.txt"
-    return folder / name, gt, report.sensor
+    return folder / name, gt, report

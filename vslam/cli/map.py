@@ -77,7 +77,7 @@ def _contents(map_: Map, reconstruction: Reconstruction) -> Rows:
 
     r = reconstruction
     path = np.linalg.norm(np.diff(r.T_wc[:, :3, 3], axis=0), axis=1).sum()
-    unit = "units" if r.camera.monocular else "m"
+    unit = "units" if r.camera.monocular and not map_.scalars.metric else "m"
     observations = f"{len(r.xy)}, {map_.n_rows} keypoints in total"
     if len(r.xy):
         observations += (

@@ -106,7 +106,7 @@ def evaluate_loops(outcome: RunOutcome) -> LoopEvaluation | None:
     T_wc, times = truth.T_wc @ outcome.sequence.camera.T_mounted_camera, truth.timestamps
     done = int(np.searchsorted(times, outcome.trajectory.timestamps[-1], side="right"))
     loops = outcome.loops
-    if outcome.alignment == "sim3":
+    if outcome.sequence.camera.monocular:
         metres = metres_per_unit(np.array([track.T_wc for track in outcome.tracks]), T_wc[:done])
         frames = outcome.keyframe_frames
         loops = [_in_metres(edge, float(metres[frames[edge.match]])) for edge in loops]

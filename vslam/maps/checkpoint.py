@@ -14,7 +14,7 @@ from vslam.types.map import Map
 from vslam.types.states import Checkpoint, PublishedState
 from vslam.types.track import Track
 
-SCHEMA = 5
+SCHEMA = 6
 _MOST = 1e12  # metres, pixels or seconds
 LOOP_SHAPES = {
     "LoopEdge.T_query_match": (4, 4),

@@ -26,7 +26,11 @@ from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.global_mapping import GlobalSnapshot, apply_solution, take_snapshot
 from vslam.backend.local_mapping import adjust_locally, strong_neighbours
 from vslam.backend.loop_correction import move_keyframes
-from vslam.backend.similarity_graph import loop_in_new_units, move_keyframes_similarly
+from vslam.backend.similarity_graph import (
+    loop_in_new_units,
+    move_keyframes_similarly,
+    similarity,
+)
 from vslam.loopclosure.consistency import LoopConsistency
 from vslam.loopclosure.detector import LoopDetector
 from vslam.loopclosure.verifier import Verifier
@@ -34,6 +38,7 @@ from vslam.method.hypotheses import Hypothesis, Solution, solve
 from vslam.support.plugins import reason
 from vslam.types.context import Context
 from vslam.types.features import Features
+from vslam.types.geometry import inverse, inverses
 from vslam.types.loops import LoopCandidate, LoopCorrection, LoopEdge
 from vslam.types.map import Map
 from vslam.types.map_kernels import cut_path
@@ -290,6 +295,19 @@ class LoopClosing:
             self.closed = [loop_in_new_units(closed, growth) for closed in self.closed]
         else:
             move_keyframes(map_, keyframes, solution.T_cw)
+
+    def rescale(self, map_: Map, first: int, scale: float) -> None:
+        """Multiply lengths by ``scale`` from a keyframe on, whose pose stays as it is. If it is the
+        first one, the world frame stays as it is."""
+        self.finish(map_)
+        keyframes = map_.living_keyframes()
+        keyframes = keyframes[keyframes >= first]
+        T_wc = inverses(map_.arrays.T_cw[keyframes])
+        centre = inverse(map_.keyframe_pose(first))[:3, 3] if first else np.zeros(3)
+        T_wc[:, :3, 3] = centre + scale * (T_wc[:, :3, 3] - centre)
+        growth = move_keyframes_similarly(map_, keyframes, similarity(T_wc, scale))
+        self.closed = [loop_in_new_units(closed, growth) for closed in self.closed]
+        self._consistency.reset()
 
     def _start_global(self, map_: Map, keyframe: int) -> _PendingAdjustment:
         config = self._config.loops

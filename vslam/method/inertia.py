@@ -5,7 +5,9 @@ relocalisation move the pose of the camera in the map, but they do not change ho
 moves, or where down is.
 
 First, the poses of a short stretch of tracked frames are collected, until they give gravity, the
-velocity and the biases (``backend/inertial_start.py``). From then on, a filter follows them
+velocity and the biases (``backend/inertial_start.py``). Those of one camera must also give the
+scale of the map. They are then taken from the map when a keyframe has been mapped, because bundle
+adjustment has improved them, and the odometry has not. From then on, a filter follows them
 (``backend/inertial_filter.py``). Samples predict the pose of the next frame, and the tracked pose
 corrects the state. A camera that is lost is carried on by the samples alone.
 """
@@ -25,10 +27,12 @@ from vslam.backend.inertial_filter import (
     camera_pose,
     corrected_by_pose,
     corrected_by_rest,
+    in_another_world,
     propagated,
 )
-from vslam.backend.inertial_start import MAX_MISFIT, PoseStretch, find_gravity
+from vslam.backend.inertial_start import MAX_MISFIT, GravityState, PoseStretch, find_gravity
 from vslam.backend.preintegration import cross_matrix
+from vslam.types.frame_poses import PoseRun
 from vslam.types.geometry import Matrix, inverse
 from vslam.types.imu import (
     GRAVITY,
@@ -48,6 +52,14 @@ LONGEST_GAP = 0.1
 START_S, RETRY_S, STRETCH_S, MOST_POSES = 0.5, 0.25, 1.0, 20
 FEWEST_POSES, LONGEST_S = 6, 2.5
 KEPT_S = 3.0  # s for which samples are kept
+# Stretches from which the scale of one camera is tried to be found, in seconds. The first poses of
+# a map are often so wrong that only a shorter stretch agrees with the samples. It is tried at most
+# every SCALE_RETRY_S seconds. A scale that is known is replaced by one whose standard deviation is
+# smaller by the factor MORE_CERTAIN, until it is as certain as SCALE_SIGMA.
+SCALE_STRETCHES, SCALE_RETRY_S = (8.0, 4.0, 2.0), 0.5
+SCALE_SIGMA, MORE_CERTAIN = 0.004, 0.7
+# Standard deviation of a feature in the image, as seen in the errors of the poses of one camera.
+SIGMA_PX = 0.15
 # Standard deviations of poses by images at the start, along each axis: metres and radians. Errors
 # of the covariances that the images give are not independent from frame to frame, so those
 # covariances are multiplied by POSE_INFLATION, and are at least as large as these.
@@ -67,21 +79,29 @@ IMU_REFUSED = (
     "rad/s and m/s^2."
 )
 
+SCALE_UNKNOWN = (
+    "The unit of length is not the metre, because the camera did not accelerate enough for the IMU "
+    "to tell the scale: begin with a few quick movements."
+)
+
 
 def is_refused(inertia: Inertia) -> bool:
     """Return whether the IMU is not used, because it contradicts the images."""
     return inertia.disagreements >= MOST_DISAGREEMENTS
 
 
-def with_samples(inertia: Inertia, samples: Matrix) -> Inertia:
+def with_samples(inertia: Inertia, samples: Matrix, kept_s: float = KEPT_S) -> Inertia:
     """Add ``(N, 7)`` samples, which may be late or repeated. Old samples are forgotten.
+
+    Args:
+        kept_s: for how many seconds samples are kept.
 
     Raises:
         ValueError: the shape is not ``(N, 7)``.
     """
     known = tidied(np.concatenate([inertia.samples, samples])).samples
     if len(known):
-        since = known[-1, 0] - KEPT_S
+        since = known[-1, 0] - kept_s
         if inertia.state is not None:
             since = min(since, inertia.state.timestamp)
         known = known[max(int(np.searchsorted(known[:, 0], since)) - 1, 0) :]
@@ -166,6 +186,62 @@ def lost(inertia: Inertia, predicted: InertialState | None, seconds: float) -> I
     if predicted is None:
         return _forgotten(inertia)
     return replace(inertia, state=predicted, carried_s=inertia.carried_s + seconds)
+
+
+def seeks_scale(inertia: Inertia) -> bool:
+    """Return whether the scale of the map of one camera is not certain enough yet."""
+    return not 0.0 <= inertia.scale_sigma <= SCALE_SIGMA
+
+
+def found_scale(
+    inertia: Inertia, run: PoseRun, sigma: float, calibration: ImuCalibration
+) -> tuple[Inertia, GravityState | None]:
+    """Try to find the scale of the map of one camera from the frames that were tracked last.
+
+    Args:
+        run: poses of the camera as it is mounted, in the map.
+        sigma: standard deviation of these poses along each axis, in units of the map.
+
+    Returns:
+        What is known, and the scale with the state of the IMU at the last pose, in metres. None if
+        the scale is not certain, or not much more certain than it was.
+    """
+    times, found = run.times, None
+    now = float(times[-1]) if len(times) else inertia.tried
+    if now - inertia.tried < SCALE_RETRY_S:
+        return inertia, None
+    limit = MORE_CERTAIN * inertia.scale_sigma if inertia.scale_sigma >= 0.0 else np.inf
+    for seconds in SCALE_STRETCHES:
+        chosen = times >= now - seconds
+        if now - times[0] < 0.5 * seconds or found is not None:
+            continue
+        stretch = PoseStretch(times[chosen], run.T_wc[chosen], sigma, SIGMA_RAD)
+        found = find_gravity(stretch, inertia.samples, calibration, known_scale=False)
+        if found is not None and (found.doubt or found.scale_sigma > limit):
+            found = None
+    return replace(inertia, tried=now), found
+
+
+def in_metres(inertia: Inertia, found: GravityState, T_odom_map: Matrix) -> Inertia:
+    """Return what is known when the map of one camera has become metric.
+
+    Args:
+        T_odom_map: ``(4, 4)``, maps points of the map, in metres, to the frame of the odometry.
+    """
+    now = found.state.timestamp
+    return replace(
+        _forgotten(inertia),
+        state=in_another_world(found.state, T_odom_map),
+        refused=0,
+        known_since=now if inertia.known_since < 0.0 else inertia.known_since,
+        scale_sigma=found.scale_sigma,
+        metric_since=now if inertia.metric_since < 0.0 else inertia.metric_since,
+    )
+
+
+def without_scale(inertia: Inertia) -> Inertia:
+    """Return what is known when one camera begins a sub-map, whose scale is unknown."""
+    return replace(_forgotten(inertia), scale_sigma=-1.0)
 
 
 def predicted_motion(

@@ -91,6 +91,12 @@ def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, 
     return first, second
 
 
+def newest_unit(map_: Map) -> int:
+    """Return the first keyframe of a monocular map whose unit of length is that of the newest
+    keyframe: that of the newest sub-map if the map was metric before, otherwise the first one."""
+    return map_.restarts[-1] if map_.scalars.metric and map_.restarts else 0
+
+
 class LandmarkCounts:
     """Counts how often landmarks should have been seen, and how often they were found.
 

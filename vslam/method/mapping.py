@@ -20,6 +20,7 @@ from vslam.method.map_frames import (
     add_two_views,
     find_old_place,
     has_more_points,
+    newest_unit,
     observe_keyframe,
     sees_old_place,
 )
@@ -133,6 +134,19 @@ class Mapper:
             published.refer_to_new(keyframes[1], second)
             second = observe_keyframe(second, map_, keyframes[1])
         return replace(second, T_cw=published.frames.pose(second.index), twist=start.twist)
+
+    def rescale(self, scale: float, *tracks: Track) -> tuple[Track, ...]:
+        """Make the metre the unit of the map, or of its newest sub-map if the map is metric. Return
+        the moved tracks.
+
+        Args:
+            scale: metres per unit.
+            tracks: as they are when everything is complete.
+        """
+        with self.published.change() as map_:
+            self._closing.rescale(map_, newest_unit(map_), scale)
+            map_.scalars = replace(map_.scalars, metric=True)
+        return self.published.renew_view(*tracks)
 
     def find_old_place(self, track: Track) -> OldPlace | None:
         """Find a place that was mapped some time ago and to which a frame has returned."""

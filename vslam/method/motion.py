@@ -6,24 +6,33 @@ from dataclasses import replace
 
 import numpy as np
 
+from vslam.backend.inertial_filter import camera_pose
+from vslam.backend.inertial_start import GravityState
 from vslam.frontend.motion_time import RECENT, motion_seconds
 from vslam.frontend.prediction import Prediction
 from vslam.frontend.standstill import has_come_to_rest, is_small
 from vslam.frontend.tracking import uncertainty_of
 from vslam.method.inertia import (
     CARRIED_S,
+    KEPT_S,
+    SCALE_STRETCHES,
+    SIGMA_PX,
+    found_scale,
     gravity_direction,
+    in_metres,
     lost,
     predicted_covariance,
     predicted_motion,
     predicted_state,
+    seeks_scale,
     tracked,
     with_samples,
+    without_scale,
 )
 from vslam.method.inertia import found_again as anew
 from vslam.types.context import Context
 from vslam.types.features import TrackingState, TrackResult
-from vslam.types.frame_poses import FramePoses
+from vslam.types.frame_poses import FramePoses, PoseRun
 from vslam.types.geometry import (
     Matrix,
     adjoint,
@@ -31,6 +40,7 @@ from vslam.types.geometry import (
     orthonormalised,
     se3_exp,
     se3_log,
+    transform,
 )
 from vslam.types.imu import ImuCalibration, Inertia
 from vslam.types.map_view import MapView
@@ -135,7 +145,57 @@ class Motion:
 
     def add_samples(self, samples: Matrix) -> None:
         """Add samples of the IMU, see ``Slam.add_imu``."""
-        self.state = replace(self.state, inertia=with_samples(self.state.inertia, samples))
+        kept_s = SCALE_STRETCHES[0] + 1.0 if self.seeks_scale else KEPT_S
+        inertia = with_samples(self.state.inertia, samples, kept_s)
+        self.state = replace(self.state, inertia=inertia)
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether an IMU with known calibration has sent samples."""
+        return self._imu is not None and len(self.state.inertia.samples) > 0
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether lengths are in metres."""
+        return not self._context.camera.monocular or self.state.inertia.scale_sigma >= 0.0
+
+    @property
+    def seeks_scale(self) -> bool:
+        """Whether the IMU is to tell the scale of a monocular map."""
+        usable = self._imu is not None and self._context.camera.monocular
+        return usable and seeks_scale(self.state.inertia)
+
+    def find_scale(self, view: MapView, keyframe: int) -> GravityState | None:
+        """Try to find the scale of a monocular map from the last frames and the samples. Return it
+        if it is certain, or much more certain than it was.
+
+        Args:
+            keyframe: the first keyframe whose unit of length is that of the newest keyframe.
+        """
+        local, camera = view.local_landmarks, self._context.camera
+        run = self._frames.last_run(SCALE_STRETCHES[0], keyframe)
+        if self._imu is None or not len(local.ids) or not len(run.times):
+            return None
+        depth = float(np.median(transform(view.T_reference, local.xyz)[:, 2]))
+        mounted = PoseRun(run.times, camera.as_mounted(run.T_wc))
+        sigma = SIGMA_PX / camera.fx * depth
+        inertia, found = found_scale(self.state.inertia, mounted, sigma, self._imu)
+        self.state = replace(self.state, inertia=inertia)
+        return found
+
+    def use_metres(self, found: GravityState, *, whole: bool) -> None:
+        """Follow the camera in metres, after the map was scaled.
+
+        Args:
+            whole: whether the whole map was scaled, not only its newest sub-map.
+        """
+        assert self._imu is not None
+        odometry = self.state.odometry
+        if whole:
+            odometry = odometry.scaled(found.scale)
+        T_wc = camera_pose(found.state, self._imu.T_imu_camera)
+        inertia = in_metres(self.state.inertia, found, odometry.T_odom_camera @ inverse(T_wc))
+        self.state = replace(self.state, odometry=odometry, inertia=inertia)
 
     def _carried(self, track: Track, predicted: Prediction) -> Inertia:
         """Return what is known from the IMU after a frame that was not tracked."""
@@ -149,7 +209,7 @@ class Motion:
     ) -> Inertia:
         """Return what is known from the IMU after a tracked frame, to which the odometry moved."""
         inertia, inertial = self.state.inertia, predicted.inertial
-        if self._imu is None:
+        if self._imu is None or not self.is_metric:
             return inertia
         T_odom_camera, local = odometry.T_odom_camera, odometry.now.local
         if found_again:
@@ -182,7 +242,10 @@ class Motion:
 
     def keyframe(self) -> None:
         """Note that the last frame became a keyframe."""
-        self.state = replace(self.state, odometry=at_keyframe(self.state.odometry), lost_frames=0)
+        inertia = self.state.inertia
+        if self._context.camera.monocular and self.state.lost_frames:
+            inertia = without_scale(inertia)
+        self.state = MotionState(at_keyframe(self.state.odometry), 0, inertia)
 
     def resume(self, twist: Matrix | None = None) -> None:
         """Continue a drive whose last frame is not available.

@@ -24,6 +24,7 @@ from vslam.loopclosure.verifier import Verifier
 from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.method.closing import LoopClosing
 from vslam.method.inertia import Inertia
+from vslam.method.map_frames import newest_unit
 from vslam.method.mapping import Mapper
 from vslam.method.modes import Building, Localising, Mode
 from vslam.method.motion import Motion
@@ -36,7 +37,7 @@ from vslam.types.frame_poses import FrameTable
 from vslam.types.geometry import Matrix, inverse, orthonormalised, se3_log
 from vslam.types.imu import GRAVITY, ImuCalibration
 from vslam.types.map import Map
-from vslam.types.states import Checkpoint, ClosingState
+from vslam.types.states import Checkpoint, ClosingState, MotionState
 from vslam.types.track import By, Track
 
 _log = logging.getLogger(__name__)
@@ -164,7 +165,10 @@ class Session:
         self._context = context
         recognise = LearnedRelocalisation(images, context)
         self._relocaliser = Relocaliser(context, detector.locate, recognise)
-        self._motion = Motion(context, published.frames, imu, state.motion if state else None)
+        motion = MotionState(
+            inertia=Inertia(scale_sigma=0.0 if published.map.scalars.metric else -1.0)
+        )
+        self._motion = Motion(context, published.frames, imu, state.motion if state else motion)
         self._tracker = tracker = Tracker(context)
         self._mode: Mode = Localising(published)
         if not localize:
@@ -204,6 +208,13 @@ class Session:
         """What is known from the IMU."""
         return self._motion.state.inertia
 
+    @property
+    def lacks_scale(self) -> bool:
+        """Whether a monocular map is not metric although there is an IMU."""
+        return (
+            self.published.n_keyframes > 0 and self._motion.has_imu and not self._motion.is_metric
+        )
+
     def skip(self, timestamp: float, *, dropped: bool) -> TrackResult:
         """Add a frame without images at the predicted pose. Its state is LOST or DROPPED."""
         self._check(timestamp)
@@ -230,8 +241,30 @@ class Session:
 
     def _publish_due(self) -> None:
         """Publish what is due at the next frame. The last frame moves with the map."""
+        waited = not self.published.is_published
         moved = self.published.publish(*self._held, frame=len(self.published.frames))
         self.last = moved[0] if moved else None
+        if waited and self.published.is_published and self._mode.changes_map:
+            self._find_scale()
+
+    def _find_scale(self) -> None:
+        """Make the map metric if the last frames and the IMU tell its scale."""
+        published, motion = self.published, self._motion
+        if self.last is None or not motion.seeks_scale:
+            return
+        moved = published.complete(self.last)
+        first = newest_unit(published.map)
+        found = motion.find_scale(published.view, first)
+        if found is not None:
+            moved = self._mapper.rescale(found.scale, *moved)
+            motion.use_metres(found, whole=first == 0)
+            if first == 0:
+                self.opened = replace(self.opened, truth_alignment=None)
+            _log.info(
+                "the scale is known from the IMU at %.3f s, with a standard deviation of %.1f %%",
+                found.state.timestamp, 100.0 * found.scale_sigma,
+            )  # fmt: skip
+        self.last = replace(moved[0], still=None) if found else moved[0]
 
     def _begin(
         self,

@@ -81,7 +81,7 @@ def explorer_data(
     inliers = np.array([track.n_inliers for track in outcome.tracks]).clip(0, 65535)
     state = np.array([states.index(str(track.state)) for track in outcome.tracks])
     return {
-        "unit": "" if outcome.sequence.camera.monocular and evaluation is None else " m",
+        "unit": " m" if outcome.is_metric or evaluation is not None else "",
         "floats": {name: _packed(values, "<f4") for name, values in floats.items()},
         "truth": {"x": _packed(truth[:, 0], "<f4"), "z": _packed(truth[:, 2], "<f4")},
         "states": states,

@@ -156,7 +156,9 @@ def _latency(report: ReportJson) -> list[Tile]:
 
 def _map_note(report: ReportJson) -> str:
     submaps = f", {report.submaps} sub-maps" if report.submaps > 1 else ""
-    return f"landmarks, {counted(report.keyframes, 'keyframe')}{submaps}"
+    since = report.metric_since_s
+    metric = "" if since is None else f", metric by the IMU since {since:.1f} s"
+    return f"landmarks, {counted(report.keyframes, 'keyframe')}{submaps}{metric}"
 
 
 def _loops(report: ReportJson) -> Tile:

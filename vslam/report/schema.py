@@ -120,13 +120,16 @@ class Measures(Record):
     ``loops_missed`` is the number of revisited stretches without a correct loop. Without ground
     truth, ``loops_wrong``, ``loops_found`` and ``loops_missed`` are None.
 
-    ``inertial_frames`` is the number of frames that the IMU alone carried.
+    ``inertial_frames`` is the number of frames that the IMU alone carried. ``metric_since_s`` is
+    the time from the first frame until an IMU made a monocular map metric. It is None for other
+    maps.
 
     ``interrupted`` is the reason why the run ended early, or None if it did not end early.
     """
 
     lost_frames: int
     inertial_frames: int = 0
+    metric_since_s: float | None = None
     interrupted: str | None
     ate_rmse_m: float | None
     causal_ate_rmse_m: float | None = None

@@ -162,14 +162,22 @@ def evaluate_run(outcome: RunOutcome) -> tuple[Evaluation | None, str | None]:
 
 
 def causal_ate(outcome: RunOutcome) -> float | None:
-    """Compute the ATE of the poses at the time of tracking, or None if that is impossible."""
-    ground_truth = outcome.ground_truth
-    if ground_truth is None or not outcome.tracks:
+    """Compute the ATE of the poses at the time of tracking, or None if that is impossible. Poses
+    in the unit that a map had before it became metric do not count."""
+    ground_truth, since = outcome.ground_truth, outcome.metric_since
+    tracks = [one for one in outcome.tracks if since is None or one.timestamp > since]
+    if ground_truth is None or not tracks:
         return None
     try:
-        return ate_rmse(causal_trajectory(outcome.tracks), ground_truth, outcome.alignment)
+        return ate_rmse(causal_trajectory(tracks), ground_truth, outcome.alignment)
     except InputError:
         return None
+
+
+def _metric_since_s(outcome: RunOutcome) -> float | None:
+    if outcome.metric_since is None or not outcome.tracks:
+        return None
+    return outcome.metric_since - outcome.tracks[0].timestamp
 
 
 def _measures(
@@ -180,6 +188,7 @@ def _measures(
     return {
         "lost_frames": sum(track.state == TrackingState.LOST for track in outcome.tracks),
         "inertial_frames": sum(track.state == TrackingState.INERTIAL for track in outcome.tracks),
+        "metric_since_s": _metric_since_s(outcome),
         "interrupted": outcome.interrupted,
         **{name: getattr(evaluation, name, None) for name in errors},
         "causal_ate_rmse_m": causal_ate(outcome),

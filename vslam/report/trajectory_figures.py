@@ -151,8 +151,7 @@ def gps_map(track: GpsTrack) -> Figure:
 
 
 def _new_map(title: str, outcome: RunOutcome, evaluation: Evaluation | None) -> tuple[Figure, Axes]:
-    monocular = outcome.sequence.camera.monocular
-    unit = "map units" if monocular and evaluation is None else "m"
+    unit = "m" if outcome.is_metric or evaluation is not None else "map units"
     figure, axes = new_figure(title, f"x ({unit})", f"z ({unit})", SQUARE)
     if evaluation is not None and outcome.ground_truth is not None:
         truth = outcome.ground_truth.T_wc[:, :3, 3]

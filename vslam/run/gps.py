@@ -66,7 +66,7 @@ def locate(stored: StoredMap, fixes: Fixes, config: PoseGraphConfig) -> GpsTrack
     table = table._replace(T_c_reference=T_c_reference)
     graph = essential_graph(map_, stored.loops, config, driven=True)
     positions, datum = _positions(table, map_.arrays.T_cw[: map_.n_keyframes], fixes)
-    metric = not stored.camera.monocular
+    metric = not stored.camera.monocular or map_.scalars.metric
     found = anchor(graph, map_.timestamps[: map_.n_keyframes], positions, config, metric=metric)
     trajectory = _in_map(table, inverses(found.T_enu_k), found.scale)
     S, visual = found.S_enu_w, _in_map(table, graph.T_cw).T_wc[:, :3, 3]

@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     from vslam.run.gps import GpsTrack
 
 
-def alignment_of(sensor: str) -> str:
-    """Return the kind of alignment with the ground truth: ``sim3`` for monocular, else ``se3``."""
-    return "sim3" if sensor == "mono" else "se3"
+def alignment_of(sensor: str, *, metric: bool = False) -> str:
+    """Return the kind of alignment with the ground truth: ``se3``, or ``sim3`` for a monocular
+    camera, unless an IMU has made its map metric."""
+    return "sim3" if sensor == "mono" and not metric else "se3"
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,9 @@ class RunOutcome:
         gaps: stretches whose final poses relative to the world frame were not measured.
         gravity: ``(3,)`` acceleration of free fall in the world frame, in m/s^2. None if no IMU has
             measured it.
+        metric_since: time in seconds since when an IMU has made a monocular map metric. Poses at
+            the time of tracking were in another unit before. None if the map is not metric, or if
+            the camera measures depth.
         gps_track: the georeferenced drive. None if the run has no GPS.
         interrupted: the reason why the run ended early, such as "Ctrl-C" or a truncated file.
         compared: the outcome of each loop detector in ``settings.compare``, without its map. The
@@ -97,6 +101,7 @@ class RunOutcome:
     n_submaps: int = 1
     gaps: list[Gap] = field(default_factory=list)
     gravity: NDArray[np.float64] | None = None
+    metric_since: float | None = None
     gps_track: GpsTrack | None = None
     interrupted: str | None = None
     step_s: float = 0.0
@@ -105,12 +110,17 @@ class RunOutcome:
     @property
     def alignment(self) -> str:
         """The kind of transformation that aligns the trajectory with the ground truth."""
-        return alignment_of(self.sequence.camera.sensor)
+        return alignment_of(self.sequence.camera.sensor, metric=self.is_metric)
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether the final poses are in metres, not in the arbitrary unit of a monocular map."""
+        return not self.sequence.camera.monocular or self.metric_since is not None
 
     @property
     def gap_sentences(self) -> list[str]:
         """Sentences about ``gaps``."""
-        unit = "map units" if self.sequence.camera.monocular else "m"
+        unit = "m" if self.is_metric else "map units"
         return sentences(self.gaps, len(self.tracks), unit)
 
     @property

@@ -236,6 +236,7 @@ class SlamRun:
             n_submaps=len({0, *slam.map.restarts}) if slam.map.n_keyframes else 0,
             gaps=slam.gaps(),
             gravity=slam.gravity,
+            metric_since=slam.metric_since,
         )
 
     def _source_warnings(self, pair_warnings: list[str]) -> list[str]:

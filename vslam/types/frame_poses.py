@@ -65,6 +65,18 @@ class FrameTable(NamedTuple):
         return FrameTable._make(values[:frames] for values in self)
 
 
+class PoseRun(NamedTuple):
+    """The poses of N frames that were tracked one after the other.
+
+    Attributes:
+        times: ``(N,)`` float64 seconds.
+        T_wc: ``(N, 4, 4)`` float64.
+    """
+
+    times: NDArray[np.float64]
+    T_wc: NDArray[np.float64]
+
+
 def _room_for(frames: int) -> FrameTable:
     return FrameTable(
         np.zeros(frames),
@@ -170,6 +182,22 @@ class FramePoses:
         if unit != self._frames.unit_scale[index]:
             T_c_reference[:3, 3] *= unit / self._frames.unit_scale[index]
         return T_c_reference @ T_kw
+
+    def last_run(self, seconds: float, keyframe: int) -> PoseRun:
+        """Return the poses of the frames that were tracked last, up to the newest frame, without a
+        lost frame between them.
+
+        Args:
+            seconds: duration of the run, at most.
+            keyframe: the poses of the frames are relative to this keyframe or a later one.
+        """
+        frames, end = self._frames, self._n
+        begin = int(np.searchsorted(frames.timestamp[:end], frames.timestamp[end - 1] - seconds))
+        usable = frames.tracked[begin:end] & (frames.reference[begin:end] >= keyframe)
+        others = np.flatnonzero(~usable)
+        begin += int(others[-1]) + 1 if len(others) else 0
+        T_wc = np.array([inverse(self.pose(k)) for k in range(begin, end)]).reshape(-1, 4, 4)
+        return PoseRun(frames.timestamp[begin:end].copy(), T_wc)
 
     def trajectory(self) -> Trajectory:
         """Return the pose of every frame.

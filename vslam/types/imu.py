@@ -235,6 +235,9 @@ class Inertia:
         disagreements: how often poses and samples did not agree.
         tried: time of the last start, in seconds.
         known_since: time since when gravity is known, in seconds; -1 if it never was.
+        scale_sigma: standard deviation of the logarithm of the scale of the map of one camera; -1
+            if its unit is not known to be the metre. Unused for cameras that measure depth.
+        metric_since: time since when this scale is known, in seconds; -1 if it never was.
     """
 
     samples: Matrix = field(default_factory=no_samples)
@@ -246,3 +249,5 @@ class Inertia:
     disagreements: int = 0
     tried: float = -1.0
     known_since: float = -1.0
+    scale_sigma: float = -1.0
+    metric_since: float = -1.0

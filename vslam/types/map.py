@@ -151,12 +151,14 @@ class Scalars:
         offset_information: inverse variance of the measurements from which ``disparity_offset`` was
             estimated.
         calibrated_until: the newest keyframe from which the disparity offset was estimated, or -1.
+        metric: whether an IMU has shown that the unit of a monocular map is the metre.
     """
 
     session: int = 0
     disparity_offset: float = 0.0
     offset_information: float = 0.0
     calibrated_until: int = NONE
+    metric: bool = False
 
 
 def _grown(array: NDArray, capacity: int) -> NDArray:

@@ -94,6 +94,18 @@ class PoseUncertainty:
             matrix.T[_UPPER] = values
         return cls(local, drift, int(numbers[-1]), np.array(numbers[-7:-1]), gaps)
 
+    def scaled(self, factor: float) -> PoseUncertainty:
+        """Return the uncertainty in another unit, in which lengths are ``factor`` times as long."""
+        D = np.repeat([factor, 1.0], 3)
+        both = np.outer(D, D)
+        return PoseUncertainty(
+            both * self.local,
+            both * self.drift,
+            self.n_keyframes,
+            D * self.offset,
+            both * self.gaps,
+        )
+
     @property
     def covariance(self) -> Matrix:
         """``(6, 6)`` covariance of the pose relative to the start of the drive."""
@@ -189,6 +201,12 @@ class OdometryState:
         default_factory=lambda: PoseUncertainty(np.zeros((6, 6)), np.zeros((6, 6)), 0)
     )
     lost_s: float = -1.0
+
+    def scaled(self, factor: float) -> OdometryState:
+        """Return the state in another unit, in which lengths are ``factor`` times as long."""
+        T = self.T_odom_camera.copy()
+        T[:3, 3] *= factor
+        return OdometryState(T, self.now.scaled(factor), self.lost_s)
 
 
 def moved(

@@ -28,8 +28,8 @@ from vslam_lab.bench.grid import Cell
 CONFIG = Config().model_dump_json(indent=2) + "\n"
 
 
-def options_for(out: Path) -> execute.RunOptions:
-    return execute.RunOptions(
+def options_for(out: Path) -> execute.CellOptions:
+    return execute.CellOptions(
         data=None, config=CONFIG, threads=1, command=COMMAND, scratch=execute.scratch_folder(out)
     )
 
@@ -183,7 +183,7 @@ def test_a_run_that_tracked_nothing_is_a_result_and_one_not_written_is_none(stub
 
 
 def test_a_runner_that_does_not_start_is_a_failed_cell(tmp_path: Path):
-    options = execute.RunOptions(None, CONFIG, 1, command=("/no/such/program",))
+    options = execute.CellOptions(None, CONFIG, 1, command=("/no/such/program",))
     (outcome,) = execute.run_here(CELLS[:1], options, 1, tmp_path)
     assert isinstance(outcome, execute.Failed)
     assert "No such file" in outcome.message
@@ -295,7 +295,7 @@ def bench(stub: Path, kitti_tree: Path, tmp_path: Path, monkeypatch, capsys):
     """Run ``vslam bench`` with a stub in place of runs. Return the exit code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        execute, "RunOptions", functools.partial(execute.RunOptions, command=COMMAND)
+        execute, "CellOptions", functools.partial(execute.CellOptions, command=COMMAND)
     )
     monkeypatch.setattr("vslam.run.warmup.is_cold", lambda: False)
 
@@ -472,7 +472,7 @@ def test_a_real_grid_killed_and_resumed(kitti_tree: Path, tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_cell_runs_with_the_networks_that_are_shipped(kitti_tree: Path, tmp_path: Path):
-    options = execute.RunOptions(kitti_tree, CONFIG, threads=2, scratch=tmp_path / "scratch")
+    options = execute.CellOptions(kitti_tree, CONFIG, threads=2, scratch=tmp_path / "scratch")
     cell = Cell("kitti", "00", "none", "both", 0)
     outcome = execute.run_cell(cell, options)
     assert isinstance(outcome, execute.Finished), outcome

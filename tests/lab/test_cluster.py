@@ -66,7 +66,7 @@ def test_the_cell_of_a_dead_worker_is_run_elsewhere(cluster, stub: Path, tmp_pat
     held.touch()
     (stub / "fail-05-none-none-0").touch()
     out = tmp_path / "bench"
-    options = execute.RunOptions(None, CONFIG, 1, command=COMMAND)
+    options = execute.CellOptions(None, CONFIG, 1, command=COMMAND)
     with closing(run_on_cluster(CELLS[:5], options, address, out)) as running:
         outcomes = [next(running)]
         wait_for(lambda: "00-none-bow-0" in dict(started(stub)))
@@ -88,7 +88,7 @@ def test_the_cell_of_a_dead_worker_is_run_elsewhere(cluster, stub: Path, tmp_pat
 def test_leaving_stops_the_workers_runs(cluster, stub: Path, tmp_path: Path):
     address, workers = cluster
     (stub / "hold-00-none-bow-0").touch()
-    options = execute.RunOptions(None, CONFIG, 1, command=COMMAND)
+    options = execute.CellOptions(None, CONFIG, 1, command=COMMAND)
     with closing(run_on_cluster(CELLS[:2], options, address, tmp_path / "bench")) as running:
         next(running)
         wait_for(lambda: len(started(stub)) == 2)
@@ -98,7 +98,7 @@ def test_leaving_stops_the_workers_runs(cluster, stub: Path, tmp_path: Path):
 @pytest.mark.slow
 def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("vslam_lab.bench.cluster._CONNECT_S", 1)
-    options = execute.RunOptions(None, CONFIG, 1)
+    options = execute.CellOptions(None, CONFIG, 1)
     with (
         pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: no scheduler answers"),
         closing(run_on_cluster(CELLS, options, "tcp://127.0.0.1:9", tmp_path)) as running,
@@ -114,10 +114,10 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, monkeypatch):
 def test_an_address_that_cannot_be_used_leaves_no_client_behind(address: str, said: str):
     code = (
         "from vslam_lab.bench.cluster import run_on_cluster\n"
-        "from vslam_lab.bench.execute import RunOptions\n"
+        "from vslam_lab.bench.execute import CellOptions\n"
         "from vslam.support.errors import InputError\n"
         "try:\n"
-        f"    next(run_on_cluster([], RunOptions(None, '', 1), {address!r}, None))\n"
+        f"    next(run_on_cluster([], CellOptions(None, '', 1), {address!r}, None))\n"
         "except InputError as error:\n"
         "    print(error)\n"
     )

@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from vslam.support.errors import InputError
-from vslam_lab.bench.execute import CellOutcome, Failed, RunOptions, publish, run_cell
+from vslam_lab.bench.execute import CellOptions, CellOutcome, Failed, publish, run_cell
 from vslam_lab.bench.grid import Cell
 
 _CONNECT_S = 10
@@ -21,7 +21,7 @@ _POLL_S = 2.0  # time between checks of the stop event; each check is a request 
 
 
 def run_on_cluster(
-    cells: Collection[Cell], options: RunOptions, scheduler: str, out: Path
+    cells: Collection[Cell], options: CellOptions, scheduler: str, out: Path
 ) -> Generator[CellOutcome, None, None]:
     """Run the cells of a benchmark (one run each) on the workers of a Dask scheduler.
 
@@ -81,7 +81,7 @@ def _require_certificates(scheduler: str) -> None:
         )
 
 
-def _run_on_worker(cell: Cell, options: RunOptions, stop: str) -> CellOutcome:
+def _run_on_worker(cell: Cell, options: CellOptions, stop: str) -> CellOutcome:
     from distributed import Event
 
     event = Event(stop)

@@ -31,7 +31,7 @@ _PARTS, _FAILED = ".parts", "failed"
 
 
 @dataclass(frozen=True)
-class RunOptions:
+class CellOptions:
     """Options that are the same for all runs of a benchmark.
 
     Attributes:
@@ -78,7 +78,7 @@ CellOutcome = Finished | Failed
 
 
 def run_cell(
-    cell: Cell, options: RunOptions, stopped: Callable[[], bool] = lambda: False
+    cell: Cell, options: CellOptions, stopped: Callable[[], bool] = lambda: False
 ) -> CellOutcome:
     """Run one cell of a benchmark (a single run) in a temporary folder, and return its files.
 
@@ -109,7 +109,7 @@ def run_cell(
 
 
 def run_here(
-    cells: Collection[Cell], options: RunOptions, jobs: int, out: Path
+    cells: Collection[Cell], options: CellOptions, jobs: int, out: Path
 ) -> Generator[CellOutcome, None, None]:
     """Run the cells of a benchmark on this machine, ``jobs`` cells at a time.
 

@@ -21,7 +21,7 @@ from vslam.support.options import with_paths, words_of
 if TYPE_CHECKING:
     from vslam.datasets.frames import Source
     from vslam.types.source_options import SourceOptions
-    from vslam_lab.bench.execute import CellOutcome, RunOptions
+    from vslam_lab.bench.execute import CellOptions, CellOutcome
     from vslam_lab.bench.grid import Cell
 
 _ORBSLAM3 = "orbslam3"
@@ -128,7 +128,7 @@ class Cells:
     given: SourceOptions
     systems: Systems
     sequences: dict[str, Source]
-    options: RunOptions
+    options: CellOptions
     jobs: int
     scheduler: str | None
     out: Path
@@ -192,7 +192,7 @@ def open_cells(
             sequence.
     """
     from vslam.support.machine import available_cores
-    from vslam_lab.bench.execute import RunOptions, scratch_folder
+    from vslam_lab.bench.execute import CellOptions, scratch_folder
 
     out, console = out.absolute(), Console(shown=shown)
     kind = kind_of_source(given)
@@ -205,7 +205,7 @@ def open_cells(
             "test vslam alone."
         )
     program = (sys.executable, "-m", "vslam_lab.cli.child", "foreign")
-    options = RunOptions(
+    options = CellOptions(
         data=Path(given.data) if kind != "synthetic" else None,
         config=read_thresholds(config).model_dump_json(indent=2)
         + "\n",  # in the form in which a run writes it

@@ -10,8 +10,8 @@ import torch
 from siamese_worlds import small_settings, views
 from torch.nn import functional
 
-from vslam.loopclosure.siamese.images import turn_homography
 from vslam.support.errors import InputError
+from vslam_lab.sources.image_source import turn_homography
 from vslam_lab.training.branches import CapsuleBranch, CapsuleShape, Layout
 from vslam_lab.training.initial_network import resized, starting_network
 from vslam_lab.training.lite import LiteExtractor

@@ -11,8 +11,9 @@ import torch
 from pydantic import ValidationError
 from siamese_worlds import SMALL, masked, small_network, small_settings, views
 
-from vslam.loopclosure.siamese.images import parse_size, to_size
+from vslam.loopclosure.siamese.images import to_size
 from vslam.support.errors import InputError
+from vslam_lab.sources.image_source import parse_size
 from vslam_lab.training.augmentation import STRONG, augment
 from vslam_lab.training.branches import CapsuleShape, Layout
 from vslam_lab.training.export import export_onnx

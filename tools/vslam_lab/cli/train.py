@@ -129,8 +129,8 @@ def train(
     """
     _require_libraries("train")
     from vslam.cli.console import Console
-    from vslam.loopclosure.siamese.images import parse_size
     from vslam.support.machine import available_cores
+    from vslam_lab.sources.image_source import parse_size
     from vslam_lab.sources.source_registry import open_source
     from vslam_lab.training.checkpoint import CHECKPOINT
     from vslam_lab.training.data import load, refuse_test_data
@@ -250,7 +250,7 @@ def places(
     out: Annotated[Path, option(OUTPUT, "FILE", "File to write.")] = Path("places.npz"),
 ) -> None:
     """Pack images into one small file for training on another machine."""
-    from vslam.loopclosure.siamese.images import parse_size
+    from vslam_lab.sources.image_source import parse_size
     from vslam_lab.sources.pack import write_pack
     from vslam_lab.sources.source_registry import open_source
 

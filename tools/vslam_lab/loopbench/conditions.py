@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.perturbation import parse_perturbation
-from vslam.loopclosure.siamese.images import turn_homography
 from vslam.support.errors import InputError, did_you_mean
+from vslam_lab.sources.image_source import turn_homography
 
 Image = NDArray[np.uint8]
 

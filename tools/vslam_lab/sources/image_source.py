@@ -4,17 +4,20 @@ that these readers share."""
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.loopclosure.siamese.images import Fit, Size, read_grey, to_size
-from vslam.support.errors import InputError
+from vslam.datasets.image_files import read_grey
+from vslam.loopclosure.siamese.images import Fit, Size, to_size
+from vslam.support.errors import InputError, UnreadableImageError
 from vslam.support.untrusted import is_image
 
 SAME, UNKNOWN, DIFFERENT = 1, 0, -1
+_FIELD_OF_VIEW = 80.0  # horizontal field of view that turn_homography assumes, degrees
 _NO_TRUTH = (
     "{}: contains no ground truth (a square matrix with at least one match); give the loop matrix "
     "of these images."
@@ -65,7 +68,8 @@ class ImageSource:
 
     def grey(self, index: int) -> NDArray[np.uint8]:
         """Read an image as ``(H, W)`` uint8. It is undistorted, but not resized."""
-        image = read_grey(self.images[index], self.names[index])
+        file = self.images[index]
+        image = read_grey(file) if isinstance(file, Path) else _decoded(file, self.names[index])
         return image if self.calibration is None else undistorted(image, self.calibration)
 
     def select(self, chosen: NDArray[np.int64]) -> ImageSource:
@@ -82,6 +86,17 @@ class ImageSource:
         )
 
 
+def _decoded(encoded: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+    import cv2
+
+    image = None
+    with suppress(cv2.error):  # too large, or empty
+        image = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise UnreadableImageError(Path(name), "cannot be decoded; pack the images again.")
+    return np.asarray(image, np.uint8)
+
+
 def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Remove the radial and tangential distortion of an image (Brown's model). The image size and
     the camera matrix stay the same."""
@@ -90,6 +105,39 @@ def undistorted(image: NDArray[np.uint8], calibration: NDArray[np.float64]) -> N
     fx, fy, cx, cy = calibration[:4]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     return np.asarray(cv2.undistort(image, K, calibration[4:]), np.uint8)
+
+
+def parse_size(text: str) -> Size:
+    """Parse an image size: ``129`` (a square) or ``81x145`` (height and width).
+
+    Raises:
+        InputError: the text has a different form, or a side is below 32 pixels.
+    """
+    height, by, width = text.lower().partition("x")
+    if not by:
+        width = height
+    if not (height.isdecimal() and width.isdecimal()):
+        raise InputError(
+            f"--pixels {text}: write the side of a square, as in 129, or height and width, as in "
+            "81x145."
+        )
+    if min(int(height), int(width)) < 32:
+        raise InputError(f"--pixels {text}: a network needs 32 pixels or more on each side.")
+    return int(height), int(width)
+
+
+def turn_homography(width: int, height: int, degrees: float) -> NDArray[np.float64]:
+    """Compute the ``(3, 3)`` homography that maps pixels of an image to pixels of the image that
+    the camera would take after a rotation to the right by ``degrees``.
+
+    The horizontal field of view is assumed to be 80 degrees, which is common on cars. The
+    homography is also valid for images whose height was scaled.
+    """
+    focal = width / 2 / np.tan(np.radians(_FIELD_OF_VIEW / 2))
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    R = np.array([[c, 0, -s], [0, 1.0, 0], [s, 0, c]])
+    return np.asarray(K @ R @ np.linalg.inv(K))
 
 
 def images_in(folder: Path) -> list[Path]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from vslam.loopclosure.siamese.images import turn_homography
+from vslam_lab.sources.image_source import turn_homography
 
 _TURNED, _ZOOMED = 0.5, 0.5  # shares of images that are rotated and zoomed, if enabled
 

@@ -23,12 +23,11 @@ from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
 from vslam.calibration.imu import read_imu
 from vslam.datasets.association import Pairing, pair_clocks, read_ground_truth
-from vslam.datasets.frames import RawSource, Source
+from vslam.datasets.frames import RawSource, Source, selection
 from vslam.datasets.image_files import (
     checked_files,
     find_sequence,
     read_image_list,
-    select_frames,
     split_line,
 )
 from vslam.datasets.imu import Imu
@@ -141,7 +140,7 @@ def _select(
         timing.add(other)
     frames = _pair(cameras, times)
     pairing = None if monocular else _pairing(base, times, frames)
-    chosen = frames[select_frames(base, len(frames), start, every, max_frames)]
+    chosen = frames[selection(base, len(frames), start, every, max_frames)]
     files = [
         tuple(camera / "data" / names[k] for k in rows)
         for camera, (_, names, _), rows in zip(cameras, listed, chosen.T, strict=True)

@@ -236,14 +236,8 @@ def selected(
     Raises:
         InputError: an option is out of range, or ``start`` is beyond the last frame.
     """
-    check_selection(start, every, max_frames)
     whole = source.n_expected
-    if whole is not None and start >= whole:
-        about = "" if source.seekable else "about "
-        raise InputError(
-            f"--start {start}: {source.name} has {about}{whole} frames; choose a smaller number."
-        )
-    chosen = slice(start, None if max_frames is None else start + every * max_frames, every)
+    chosen = selection(source.name, whole, start, every, max_frames, exact=source.seekable)
     if source.seekable:
         truth = source.ground_truth
         truth = None if truth is None else truth[chosen]
@@ -254,14 +248,31 @@ def selected(
     return replace(source, n_expected=n, play=play, timing=timing)
 
 
-def check_selection(start: int, every: int, max_frames: int | None) -> None:
-    """Check that the options that select frames are in their ranges.
+def selection(
+    source: str | Path,
+    n: int | None,
+    start: int,
+    every: int,
+    max_frames: int | None,
+    *,
+    exact: bool = True,
+) -> slice:
+    """Return the slice of at most ``max_frames`` frames: ``start``, ``start + every`` and so on.
+
+    Args:
+        source: name of the source or folder of the frames, for error messages.
+        n: number of frames, at least 1; None if it is unknown.
+        exact: whether ``n`` is exact.
 
     Raises:
-        InputError: an option is out of range.
+        InputError: an option is out of range, or ``start`` is beyond the last frame.
     """
     if start < 0 or every < 1 or (max_frames is not None and max_frames < 1):
         raise InputError("--start must be at least 0, --every and --max-frames at least 1.")
+    if n is not None and start >= n:
+        about, most = ("", f"at most {n - 1}") if exact else ("about ", "a smaller number")
+        raise InputError(f"--start {start}: {source} has {about}{n} frames; choose {most}.")
+    return slice(start, None if max_frames is None else start + every * max_frames, every)
 
 
 def _play_selected(

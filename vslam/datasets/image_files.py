@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vslam.calibration.models import Calibration
 from vslam.datasets.association import Pairing
-from vslam.datasets.frames import RawSource, Size, TimedFrame, check_selection, decoded
+from vslam.datasets.frames import RawSource, Size, TimedFrame, decoded
 from vslam.datasets.grey_levels import Levels, decode, levels_of_files
 from vslam.datasets.times import Number, Timing
 from vslam.support.errors import InputError, UnreadableImageError
@@ -268,26 +268,6 @@ def find_sequence(root: Path, name: str | None, is_sequence: Callable[[Path], bo
         names = ", ".join(path.name for path in inside)
         raise InputError(f"{wrong}; choose one with --seq: {names}.")
     return None
-
-
-def select_frames(
-    source: Path, n: int, start: int, every: int, max_frames: int | None
-) -> NDArray[np.int64]:
-    """Return the indices of the selected frames.
-
-    Args:
-        source: folder of the frames, for error messages.
-        n: number of frames, at least 1.
-        start, every, max_frames: select the frames ``start``, ``start + every`` and so on, at most
-            ``max_frames`` frames.
-
-    Raises:
-        InputError: an option is out of range, or ``start`` is beyond the last frame.
-    """
-    check_selection(start, every, max_frames)
-    if start >= n:
-        raise InputError(f"--start {start}: {source} has {n} frames; choose at most {n - 1}.")
-    return np.arange(start, n, every)[:max_frames]
 
 
 def check_not_empty(path: Path) -> None:

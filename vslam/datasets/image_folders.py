@@ -32,14 +32,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.datasets.association import DEPTH_NEAR_S, Pairing, associate
-from vslam.datasets.frames import RawSource
+from vslam.datasets.frames import RawSource, selection
 from vslam.datasets.image_files import (
     UNKNOWN_SCALE,
     DepthScale,
     checked_files,
     image_size,
     list_images,
-    select_frames,
 )
 from vslam.datasets.names import group_names, pair_names, role_of, sides_by_name
 from vslam.datasets.times import (
@@ -157,7 +156,7 @@ def open_images(
     else:
         found, timing = _find_times(places[0], first)
     times, kept = ordered_list([found[k] for k in pairs[0]], timing, _FIX)
-    selected = select_frames(folder, len(kept), start, every, max_frames)
+    selected = selection(folder, len(kept), start, every, max_frames)
     files = [list(side.values()) for side in listed]
     sides = tuple(
         tuple(side[k] for k in rows[kept[selected]])

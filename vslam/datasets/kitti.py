@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.calibration import files as calibration_files
-from vslam.datasets.frames import Source
-from vslam.datasets.image_files import checked_files, list_images, select_frames
+from vslam.datasets.frames import Source, selection
+from vslam.datasets.image_files import checked_files, list_images
 from vslam.datasets.imu import Imu
 from vslam.datasets.imu_csv import IMU_FILE, read_imu_csv
 from vslam.datasets.rectified import rectified
@@ -84,7 +84,7 @@ def open_kitti(
     rows, timing = times_of_list(path, FIX_LIST)
     of_images = [rows[k] for k in row_numbers(path, stems, len(rows))]
     times, kept = ordered_list(of_images, timing, FIX_LIST)
-    selected = select_frames(folder, len(kept), start, every, max_frames)
+    selected = selection(folder, len(kept), start, every, max_frames)
     chosen = kept[selected]
     sides = files_of_frames(places, listed, [stems[k] for k in chosen])
     truth = _read_ground_truth(base / "poses" / f"{name}.txt", stems, len(rows), chosen)

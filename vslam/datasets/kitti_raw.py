@@ -23,8 +23,8 @@ from vslam.calibration.documents import read_document
 from vslam.calibration.files import read_calibration
 from vslam.calibration.formats import Size, read_kitti_raw
 from vslam.calibration.models import Calibration
-from vslam.datasets.frames import RawSource, Source
-from vslam.datasets.image_files import checked_files, find_sequence, select_frames
+from vslam.datasets.frames import RawSource, Source, selection
+from vslam.datasets.image_files import checked_files, find_sequence
 from vslam.datasets.kitti import files_of_frames, find_cameras, row_numbers
 from vslam.datasets.kitti_imu import imu_of_drive
 from vslam.datasets.rectified import rectified
@@ -79,7 +79,7 @@ def open_kitti_raw(
     rows, timing = times_of_list(path, FIX_LIST)
     of_images = [rows[k] for k in row_numbers(path, stems, len(rows))]
     times, kept = ordered_list(of_images, timing, FIX_LIST)
-    selected = select_frames(folder, len(kept), start, every, max_frames)
+    selected = selection(folder, len(kept), start, every, max_frames)
     sides = files_of_frames(places, listed, [stems[k] for k in kept[selected]])
     name = folder.resolve().name
     images = checked_files("kitti_raw", name, np.array(times)[selected], None, sides, timing=timing)

@@ -21,14 +21,13 @@ from numpy.typing import NDArray
 from vslam.calibration.files import CALIBRATION, read_calibration
 from vslam.calibration.models import Calibration, CameraModel
 from vslam.datasets.association import DEPTH_NEAR_S, Pairing, associate, read_ground_truth
-from vslam.datasets.frames import Source
+from vslam.datasets.frames import Source, selection
 from vslam.datasets.image_files import (
     checked_files,
     depth_scale_of,
     find_sequence,
     image_size,
     read_image_list,
-    select_frames,
     split_line,
 )
 from vslam.datasets.rectified import rectified
@@ -112,7 +111,7 @@ def open_tum(
         )
         pairing = Pairing(folder, "depth image", DEPTH_NEAR_S, fix)
         pairing.count(times, frames, depth_times)
-    chosen = select_frames(folder, len(frames), start, every, max_frames)
+    chosen = selection(folder, len(frames), start, every, max_frames)
     times = times[frames[chosen]]
     colour = tuple(colour_files[k] for k in frames[chosen])
     calibration = _calibration(folder, calib, image_size(colour[0]))

@@ -15,11 +15,23 @@ from conftest import corridor_depth
 from source_files import open_from, run_source, write_calibration
 
 from vslam.datasets import depth_cameras
+from vslam.datasets.imu import SplitSamples
+from vslam.slam import Slam
 from vslam.support.errors import BrokenSourceError, InputError
+from vslam.types.geometry import se3_exp
 from vslam.types.source_options import SourceOptions
 
 FRAMES = 8
 PACKAGES = {"realsense": "pyrealsense2", "oakd": "depthai"}
+
+
+T_IMU_CAMERA = se3_exp(np.array([0.01, -0.02, 0.03, 0.4, -0.7, 1.1]))
+
+
+def measured(hz: int, base: float) -> np.ndarray:
+    """Return ``(N, 4)`` times and vectors that change linearly, so that interpolation is exact."""
+    times = 49.9 + np.arange(0.0, 1.1, 1.0 / hz)
+    return np.column_stack([times, base + times, 0.1 * times, 0.2 * times])
 
 
 @dataclass
@@ -35,6 +47,10 @@ class Recorded:
     shown: int = 0
     log: list[Any] = field(default_factory=list)
     gone: type[Exception] | None = None  # raised after the last frame, instead of a time-out
+    imu: bool = True
+    T_imu_camera: np.ndarray = field(default_factory=lambda: T_IMU_CAMERA)
+    rates: np.ndarray = field(default_factory=lambda: measured(200, 0.0))
+    forces: np.ndarray = field(default_factory=lambda: measured(100, 9.8))
 
     def following(self) -> int | None:
         if self.shown == len(self.left):
@@ -55,8 +71,10 @@ def colours(grey: np.ndarray) -> np.ndarray:
 def realsense(recorded: Recorded, serials: tuple[str, ...] = ("817", "918")) -> SimpleNamespace:
     """Mock the part of pyrealsense2 that vslam uses. Only ``align`` registers depth to colour."""
     r, c = recorded, recorded.camera
-    names = ("color", "depth", "infrared")
-    option = SimpleNamespace(emitter_enabled="emitter", stereo_baseline="baseline")
+    names = ("color", "depth", "infrared", "gyro", "accel")
+    option = SimpleNamespace(
+        emitter_enabled="emitter", stereo_baseline="baseline", global_time_enabled="global time"
+    )
 
     def frame(image: np.ndarray, k: int) -> SimpleNamespace:
         return SimpleNamespace(
@@ -64,13 +82,52 @@ def realsense(recorded: Recorded, serials: tuple[str, ...] = ("817", "918")) -> 
         )
 
     class Sensor:
+        is_motion_sensor = staticmethod(lambda: False)
         supports = staticmethod(lambda name: True)
         get_option = staticmethod(lambda name: {"baseline": 1000.0 * c.baseline}[name])
         get_depth_scale = staticmethod(lambda: r.unit)
         set_option = staticmethod(lambda name, value: r.log.append((name, value)))
 
+    class MotionProfile:
+        def __init__(self, kind: str, hz: int) -> None:
+            self.stream_type, self.fps = lambda: kind, lambda: hz
+
+    class MotionSensor(Sensor):
+        is_motion_sensor = staticmethod(lambda: True)
+        close = staticmethod(lambda: r.log.append("close motion"))
+        stop = staticmethod(lambda: r.log.append("stop motion"))
+
+        @staticmethod
+        def get_stream_profiles() -> list[MotionProfile]:
+            kinds = (("gyro", 400), ("gyro", 200), ("accel", 63), ("accel", 250))
+            return [MotionProfile(*kind) for kind in kinds]
+
+        @staticmethod
+        def open(profiles: list[MotionProfile]) -> None:
+            if r.gone is PermissionError:
+                raise RuntimeError("failed to open the HID device")
+            r.log.append([(p.stream_type(), p.fps()) for p in profiles])
+
+        @staticmethod
+        def start(callback: Any) -> None:
+            for kind, rows in (("gyro", r.rates), ("accel", r.forces)):
+                for t, *xyz in rows.tolist():
+                    motion = SimpleNamespace(**dict(zip("xyz", xyz, strict=True)))
+                    callback(
+                        SimpleNamespace(
+                            as_motion_frame=lambda m=motion: SimpleNamespace(
+                                get_motion_data=lambda: m
+                            ),
+                            get_profile=lambda k=kind: MotionProfile(k, 200),
+                            get_timestamp=lambda t=t: 1000.0 * t,
+                        )
+                    )
+
     def device(serial: str) -> SimpleNamespace:
-        return SimpleNamespace(get_info=lambda what: serial, first_depth_sensor=Sensor)
+        sensors = [Sensor(), MotionSensor()] if r.imu else [Sensor()]
+        return SimpleNamespace(
+            get_info=lambda what: serial, first_depth_sensor=Sensor, query_sensors=lambda: sensors
+        )
 
     class Config:
         def enable_device(self, serial: str) -> None:
@@ -92,7 +149,10 @@ def realsense(recorded: Recorded, serials: tuple[str, ...] = ("817", "918")) -> 
                 model="inverse_brown_conrady", coeffs=list(r.lens),
             )  # fmt: skip
 
-        def get_extrinsics_to(self, other: Stream) -> SimpleNamespace:
+        def get_extrinsics_to(self, other: Stream | MotionProfile) -> SimpleNamespace:
+            if isinstance(other, MotionProfile):
+                R, t = r.T_imu_camera[:3, :3], r.T_imu_camera[:3, 3]
+                return SimpleNamespace(rotation=R.ravel(order="F").tolist(), translation=t.tolist())
             along = c.baseline * (self.side - other.side)
             return SimpleNamespace(rotation=np.eye(3).ravel().tolist(), translation=[along, 0, 0])
 
@@ -113,7 +173,9 @@ def realsense(recorded: Recorded, serials: tuple[str, ...] = ("817", "918")) -> 
     class Pipeline:
         def start(self, config: Config) -> SimpleNamespace:
             r.log.append("start")
-            return SimpleNamespace(get_stream=lambda name, side=0: Stream(side))
+            return SimpleNamespace(
+                get_stream=lambda name, side=0: Stream(side), get_device=lambda: device("817")
+            )
 
         def try_wait_for_frames(self, timeout_ms: int) -> tuple[bool, Any]:
             k = r.following()
@@ -178,6 +240,42 @@ def depthai(recorded: Recorded, platform: str = "RVC2") -> SimpleNamespace:
 
             return SimpleNamespace(get=get)
 
+    class Imu:
+        def __init__(self) -> None:
+            self.out = SimpleNamespace(createOutputQueue=self._queue)
+
+        def enableIMUSensor(self, sensors: list[str], reportRate: int) -> None:
+            r.log.append((sorted(sensors), reportRate))
+
+        def setBatchReportThreshold(self, packets: int) -> None:
+            assert packets == 1
+
+        def setMaxBatchReports(self, packets: int) -> None:
+            assert packets >= 1
+
+        def _queue(self, maxSize: int, blocking: bool) -> SimpleNamespace:
+            assert not blocking
+            # As the driver does it, a packet repeats the last force until there is a new one.
+            nearest = np.searchsorted(r.forces[:, 0], r.rates[:, 0], side="right").clip(1) - 1
+            packets = [
+                SimpleNamespace(gyroscope=report(rate), acceleroMeter=report(force))
+                for rate, force in zip(r.rates, r.forces[nearest], strict=True)
+            ]
+            waiting = [
+                [SimpleNamespace(packets=packets[k : k + 3]) for k in range(0, len(packets), 3)]
+            ]
+
+            def tryGetAll() -> list[SimpleNamespace]:
+                if r.gone is not None and not waiting:
+                    raise r.gone("the device was disconnected")
+                return waiting.pop() if waiting else []
+
+            return SimpleNamespace(tryGetAll=tryGetAll)
+
+    def report(row: np.ndarray) -> SimpleNamespace:
+        t, x, y, z = row.tolist()
+        return SimpleNamespace(x=x, y=y, z=z, getTimestamp=lambda: timedelta(seconds=t))
+
     class Camera:
         def build(self, socket: str) -> Camera:
             self.socket = socket
@@ -229,13 +327,26 @@ def depthai(recorded: Recorded, platform: str = "RVC2") -> SimpleNamespace:
         def getPlatform(self) -> str:
             return platform
 
+        def getConnectedIMU(self) -> str:
+            return "BMI270" if r.imu else "NONE"
+
         def readCalibration(self) -> SimpleNamespace:
             def getCameraExtrinsics(source: str, to: str) -> list[list[float]]:
                 T = np.eye(4)
                 T[0, 3] = 100.0 * c.baseline * (1 if (source, to) == ("C", "B") else -1)
                 return T.tolist()
 
-            return SimpleNamespace(getCameraExtrinsics=getCameraExtrinsics)
+            def getCameraToImuExtrinsics(camera: str) -> list[list[float]]:
+                if r.T_imu_camera is None:
+                    raise RuntimeError("IMU calibration data is not available on device yet.")
+                T = r.T_imu_camera.copy()
+                T[:3, 3] *= 100.0
+                return T.tolist()
+
+            return SimpleNamespace(
+                getCameraExtrinsics=getCameraExtrinsics,
+                getCameraToImuExtrinsics=getCameraToImuExtrinsics,
+            )
 
         def close(self) -> None:
             r.log.append("close")
@@ -257,8 +368,9 @@ def depthai(recorded: Recorded, platform: str = "RVC2") -> SimpleNamespace:
     return SimpleNamespace(
         Device=Device, Pipeline=Pipeline, Platform=SimpleNamespace(RVC4="RVC4"),
         node=SimpleNamespace(
-            Camera=Camera, StereoDepth=StereoDepth, ImageAlign=ImageAlign, Sync=Sync
+            Camera=Camera, StereoDepth=StereoDepth, ImageAlign=ImageAlign, Sync=Sync, IMU=Imu
         ),
+        IMUSensor=SimpleNamespace(ACCELEROMETER_RAW="accel", GYROSCOPE_RAW="gyro"),
         CameraBoardSocket=SimpleNamespace(CAM_A="A", CAM_B="B", CAM_C="C"),
         ImgFrame=SimpleNamespace(Type=SimpleNamespace(GRAY8="GRAY8", RGB888i="RGB888i")),
         MessageQueue=SimpleNamespace(QueueException=QueueGoneError),
@@ -325,6 +437,74 @@ def test_the_frames_and_the_calibration_are_those_of_the_device(
         if frame.colour is not None:
             assert np.array_equal(frame.colour(), colours(recorded.left[k]))
     assert "stop" in recorded.log
+
+
+@pytest.mark.parametrize("sensor", ["stereo", "rgbd"])
+@pytest.mark.parametrize("dataset", ["realsense", "oakd"])
+def test_the_samples_of_the_imu_reach_each_step(dataset, sensor, recorded, monkeypatch):
+    connect(monkeypatch, dataset, recorded)
+    source = open_from(dataset, "", sensor=sensor)
+    assert source.imu is not None
+    assert source.imu.live
+    assert source.imu.calibration is not None
+    np.testing.assert_allclose(source.imu.calibration.T_imu_camera, T_IMU_CAMERA, atol=1e-9)
+    passed: list[np.ndarray] = []
+    monkeypatch.setattr(Slam, "add_imu", lambda self, samples: passed.append(np.array(samples)))
+    run_source(source)
+    rows = np.concatenate(passed)
+    between = recorded.rates[:, 0] <= recorded.forces[-1, 0]  # later rates wait for a force
+    np.testing.assert_allclose(rows[:, :4], recorded.rates[between], atol=1e-6)
+    np.testing.assert_allclose(rows[:, 4], 9.8 + rows[:, 0], atol=1e-6)
+    if dataset == "realsense":
+        assert [("gyro", 200), ("accel", 250)] in recorded.log
+        assert ("global time", 1.0) in recorded.log
+        assert recorded.log[-3:] == ["stop motion", "close motion", "stop"]
+    else:
+        assert (["accel", "gyro"], 200) in recorded.log
+
+
+@pytest.mark.parametrize("dataset", ["realsense", "oakd"])
+def test_a_device_without_an_imu_or_without_its_calibration(dataset, recorded, monkeypatch):
+    recorded.T_imu_camera = np.zeros((4, 4))  # as devices hold it that were never calibrated
+    connect(monkeypatch, dataset, recorded)
+    imu = open_from(dataset, "", sensor="stereo").imu
+    assert imu is not None
+    assert imu.calibration is None
+    if dataset == "oakd":
+        recorded.T_imu_camera, recorded.shown = None, 0
+        assert open_from(dataset, "", sensor="stereo").imu.calibration is None
+    recorded.imu, recorded.shown = False, 0
+    assert open_from(dataset, "", sensor="stereo").imu is None
+
+
+def test_an_imu_that_cannot_be_started_costs_no_images(recorded, monkeypatch):
+    recorded.gone = PermissionError
+    connect(monkeypatch, "realsense", recorded)
+    source = open_from("realsense", "", sensor="stereo")
+    assert source.imu is None
+    assert source.warnings == (
+        "realsense 817: the IMU is not used, because it cannot be started "
+        "(failed to open the HID device).",
+    )
+
+
+def test_rates_wait_for_the_next_force_and_old_samples_are_dropped():
+    samples = SplitSamples()
+    for t in (0.0, 0.005, 0.01, 0.015):
+        samples.add_rate(t, t, 0.0, 0.0)
+    assert len(samples.read()) == 0
+    samples.add_force(0.0, 0.0, 0.0, 1.0)
+    assert len(samples.read()) == 0
+    samples.add_force(0.01, 0.0, 0.0, 2.0)
+    rows = samples.read()
+    np.testing.assert_allclose(rows[:, [0, 1, 6]], [(0.005, 0.005, 1.5), (0.01, 0.01, 2.0)])
+    samples.add_force(0.02, 0.0, 0.0, 4.0)
+    np.testing.assert_allclose(samples.read()[:, [0, 6]], [(0.015, 3.0)])
+    for k in range(30_000):
+        samples.add_rate(1.0 + k, 0.0, 0.0, 0.0)
+    samples.add_force(30_000.98, 0.0, 0.0, 0.0)
+    samples.add_force(30_001.02, 0.0, 0.0, 0.0)
+    assert samples.read()[:, 0].tolist() == []
 
 
 def test_depth_of_the_newer_oak_cameras_is_registered_by_a_node(recorded, monkeypatch):

@@ -11,9 +11,8 @@ from source_files import write_bag, write_video
 from test_euroc import numbers, sensor
 from test_kitti_raw import DRIVE, FIRST, T_X, line, write_drive
 
-from vslam.datasets.bag_imu import joined
 from vslam.datasets.euroc import open_euroc
-from vslam.datasets.imu import Imu, ImuFeed
+from vslam.datasets.imu import Imu, ImuFeed, joined
 from vslam.datasets.imu_csv import HEADER, read_imu_csv
 from vslam.datasets.sources import open_source
 from vslam.support.errors import InputError

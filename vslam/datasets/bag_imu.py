@@ -14,13 +14,11 @@ import numpy as np
 
 from vslam.datasets.bag_files import Recording, messages, opened
 from vslam.datasets.bag_messages import IMU_TYPE, inertial_sample
-from vslam.datasets.imu import Imu
+from vslam.datasets.imu import Imu, joined
 from vslam.support.errors import BrokenSourceError, InputError
 from vslam.types.geometry import Matrix
-from vslam.types.imu import tidied
 
 _GYRO, _ACCEL = ("gyro",), ("accel", "acc/", "_acc")  # parts of the names of topics
-_LONGEST_S = 0.1  # between specific forces that are interpolated
 
 
 def find_imu(
@@ -102,27 +100,3 @@ def read_imu_of_bag(path: Path, topics: Sequence[str]) -> Matrix:
                 "them again with a driver that sets it."
             )
     return tables[0] if len(tables) == 1 else joined(*tables)
-
-
-def joined(gyro: Matrix, accel: Matrix) -> Matrix:
-    """Interpolate specific forces linearly at the times of angular rates.
-
-    Args:
-        gyro: ``(N, 7)`` samples whose angular rates are used.
-        accel: ``(M, 7)`` samples whose specific forces are used.
-
-    Returns:
-        ``(K, 7)`` samples: those of the gyroscope that lie between two samples of the accelerometer
-        that are at most 0.1 s apart.
-    """
-    gyro, accel = tidied(gyro).samples, tidied(accel).samples
-    if len(accel) < 2:
-        return np.empty((0, 7))
-    times = accel[:, 0]
-    after = np.searchsorted(times, gyro[:, 0], side="right").clip(1, len(times) - 1)
-    step = times[after] - times[after - 1]
-    near = (step <= _LONGEST_S) | (gyro[:, 0] == times[after - 1])
-    inside = (gyro[:, 0] >= times[0]) & (gyro[:, 0] <= times[-1]) & near
-    found = gyro[inside]
-    forces = [np.interp(found[:, 0], times, accel[:, axis]) for axis in (4, 5, 6)]
-    return np.column_stack([found[:, :4], *forces])

@@ -14,10 +14,13 @@ from numpy.typing import NDArray
 
 from vslam.calibration.models import Calibration
 from vslam.datasets.frames import Images, RawSource, TimedFrame
+from vslam.datasets.imu import Imu
 from vslam.support.errors import BrokenSourceError, InputError
 from vslam.types.camera import DepthImage, Image, ImageMap
+from vslam.types.imu import ImuCalibration
 
 FPS = 30
+IMU_HZ = 200
 TIMEOUT_S = 10
 
 
@@ -50,6 +53,8 @@ class DepthCamera:
         grab: function that waits for the next images and returns them. It returns None after a
             timeout, or if the device was unplugged.
         stop: function that stops the device.
+        imu: the live IMU of the device, calibrated for ``calibration.left``; None if it has none.
+        warnings: what the report of a run must say about the device, in sentences.
     """
 
     dataset: str
@@ -57,6 +62,8 @@ class DepthCamera:
     calibration: Calibration
     grab: Callable[[], Grabbed | None]
     stop: Callable[[], None]
+    imu: Imu | None = None
+    warnings: tuple[str, ...] = ()
 
 
 def frames_of(device: DepthCamera) -> RawSource:
@@ -70,7 +77,18 @@ def frames_of(device: DepthCamera) -> RawSource:
         depth=calibration.depth_scale is not None,
         play=partial(_play, device),
         live=True,
+        imu=device.imu,
+        warnings=device.warnings,
     )
+
+
+def calibration_of_imu(T_imu_camera: NDArray[np.float64]) -> ImuCalibration | None:
+    """Return the calibration that a device stores for its IMU; None if it was never calibrated, as
+    zeros show."""
+    try:
+        return ImuCalibration(T_imu_camera)
+    except ValueError:
+        return None
 
 
 def maker_package(name: str, extra: str) -> Any:

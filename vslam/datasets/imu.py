@@ -6,6 +6,7 @@ own clock. `ImuFeed` passes them to a run, in times of the camera's clock.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,6 +22,9 @@ from vslam.types.imu import (
     no_samples,
     tidied,
 )
+
+_LONGEST_S = 0.1  # between specific forces that are interpolated
+_MOST_WAITING = 10_000  # samples of a live device that nobody reads
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,3 +103,62 @@ class ImuFeed:
             end = int(np.searchsorted(self._waiting[:, 0], timestamp)) + 1
         begin, self._passed = self._passed, max(self._passed, min(end, len(self._waiting)))
         return self._waiting[begin : self._passed]
+
+
+def joined(gyro: Matrix, accel: Matrix) -> Matrix:
+    """Interpolate specific forces linearly at the times of angular rates.
+
+    Args:
+        gyro: ``(N, 7)`` samples whose angular rates are used.
+        accel: ``(M, 7)`` samples whose specific forces are used.
+
+    Returns:
+        ``(K, 7)`` samples: those of the gyroscope that lie between two samples of the accelerometer
+        that are at most 0.1 s apart.
+    """
+    gyro, accel = tidied(gyro).samples, tidied(accel).samples
+    if len(accel) < 2:
+        return no_samples()
+    times = accel[:, 0]
+    after = np.searchsorted(times, gyro[:, 0], side="right").clip(1, len(times) - 1)
+    step = times[after] - times[after - 1]
+    near = (step <= _LONGEST_S) | (gyro[:, 0] == times[after - 1])
+    inside = (gyro[:, 0] >= times[0]) & (gyro[:, 0] <= times[-1]) & near
+    found = gyro[inside]
+    forces = [np.interp(found[:, 0], times, accel[:, axis]) for axis in (4, 5, 6)]
+    return np.column_stack([found[:, :4], *forces])
+
+
+class SplitSamples:
+    """Joins angular rates and specific forces that a live device delivers separately.
+
+    Any thread may add them. If nobody reads them, the oldest ones are dropped.
+    """
+
+    def __init__(self) -> None:
+        self._rates: deque[tuple[float, ...]] = deque(maxlen=_MOST_WAITING)
+        self._forces: deque[tuple[float, ...]] = deque(maxlen=_MOST_WAITING)
+        self._waiting = self._newest = no_samples()
+
+    def add_rate(self, timestamp: float, x: float, y: float, z: float) -> None:
+        """Add an angular rate in rad/s."""
+        self._rates.append((timestamp, x, y, z, 0.0, 0.0, 0.0))
+
+    def add_force(self, timestamp: float, x: float, y: float, z: float) -> None:
+        """Add a specific force in m/s^2."""
+        self._forces.append((timestamp, 0.0, 0.0, 0.0, x, y, z))
+
+    def read(self) -> Matrix:
+        """Return the new samples as `joined` does. Angular rates that are later than the newest
+        specific force wait for the next one."""
+        rates = np.concatenate([self._waiting, _taken(self._rates)])[-_MOST_WAITING:]
+        forces = np.concatenate([self._newest, _taken(self._forces)])
+        last = float(forces[:, 0].max()) if len(forces) else -np.inf
+        ready = rates[:, 0] <= last
+        self._waiting, self._newest = rates[~ready], forces[forces[:, 0] == last]
+        return joined(rates[ready], forces)
+
+
+def _taken(samples: deque[tuple[float, ...]]) -> Matrix:
+    rows = [samples.popleft() for _ in range(len(samples))]
+    return np.array(rows, np.float64).reshape(-1, 7)

@@ -5,23 +5,37 @@ rectifies the images using the calibration of the device.
 
 An RGB-D frame consists of the colour image and the depth. The device computes the depth by stereo
 matching, and registers it to the colour image.
+
+Most models have an IMU. Its raw samples are in the frame of its chip, to which the calibration of
+the device refers.
 """
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from datetime import timedelta
 from typing import Any
 
 import numpy as np
 
 from vslam.calibration.models import Calibration, CameraModel
-from vslam.datasets.depth_cameras import FPS, TIMEOUT_S, DepthCamera, Grabbed, maker_package
+from vslam.datasets.depth_cameras import (
+    FPS,
+    IMU_HZ,
+    TIMEOUT_S,
+    DepthCamera,
+    Grabbed,
+    calibration_of_imu,
+    maker_package,
+)
+from vslam.datasets.imu import Imu, SplitSamples
 from vslam.support.errors import InputError
+from vslam.types.geometry import Matrix
 
 _SIZE = 640, 400
 _DEPTH_SCALE = 1000.0  # depth image units per metre
 _CM_PER_METRE = 100.0
+_IMU_MESSAGES = 2000  # that wait while a frame is processed
 
 
 def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
@@ -46,6 +60,7 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
             name = f"oakd {serial}"
             pipeline = dai.Pipeline(device)
             queue = _queue(dai, pipeline, sensor)
+            imu = _imu(dai, pipeline, device, sensor, name)
             pipeline.start()
             opened.callback(pipeline.stop)
             first = queue.get(timedelta(seconds=TIMEOUT_S))
@@ -69,7 +84,7 @@ def open_oakd(serial: str, sensor: str | None) -> DepthCamera:
         second = None if sensor == "mono" else images["second"].getFrame()
         return Grabbed(left.getTimestamp().total_seconds(), left.getFrame(), second)
 
-    return DepthCamera("oakd", serial, calibration, grab, stop)
+    return DepthCamera("oakd", serial, calibration, grab, stop, imu)
 
 
 def _queue(dai: Any, pipeline: Any, sensor: str) -> Any:
@@ -101,6 +116,40 @@ def _queue(dai: Any, pipeline: Any, sensor: str) -> Any:
     for name, images in zip(("left", "second"), outputs, strict=False):
         images.link(sync.inputs[name])
     return sync.out.createOutputQueue(maxSize=1, blocking=False)
+
+
+def _imu(dai: Any, pipeline: Any, device: Any, sensor: str, name: str) -> Imu | None:
+    """Add the IMU to the pipeline, if the device has one."""
+    if device.getConnectedIMU() in ("", "NONE"):
+        return None
+    node, raw = pipeline.create(dai.node.IMU), dai.IMUSensor
+    node.enableIMUSensor([raw.ACCELEROMETER_RAW, raw.GYROSCOPE_RAW], IMU_HZ)
+    node.setBatchReportThreshold(1)
+    node.setMaxBatchReports(10)
+    queue = node.out.createOutputQueue(maxSize=_IMU_MESSAGES, blocking=False)
+    samples = SplitSamples()
+
+    def read() -> Matrix:
+        with suppress(RuntimeError, dai.MessageQueue.QueueException):  # it was unplugged
+            for message in queue.tryGetAll():
+                for packet in message.packets:
+                    for add, report in (
+                        (samples.add_rate, packet.gyroscope),
+                        (samples.add_force, packet.acceleroMeter),
+                    ):
+                        time = report.getTimestamp().total_seconds()
+                        add(time, report.x, report.y, report.z)
+        return samples.read()
+
+    socket = dai.CameraBoardSocket.CAM_A if sensor == "rgbd" else dai.CameraBoardSocket.CAM_B
+    calibration = None
+    with suppress(RuntimeError):  # the device stores no calibration of its IMU
+        T_imu_camera = np.array(
+            device.readCalibration().getCameraToImuExtrinsics(socket), np.float64
+        )
+        T_imu_camera[:3, 3] /= _CM_PER_METRE
+        calibration = calibration_of_imu(T_imu_camera)
+    return Imu(name, read, calibration, live=True)
 
 
 def _calibration(dai: Any, device: Any, images: Any, sensor: str) -> Calibration:

@@ -5,17 +5,30 @@ projector. librealsense registers the depth to the colour image.
 
 A stereo pair consists of the two infrared images, which the device rectifies. The projector is
 switched off for stereo, because its dots would move with the camera.
+
+Models whose names end in i, such as the D435i, and the D455 have an IMU, whose gyroscope and
+accelerometer have different rates.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 
-from vslam.calibration.models import Calibration, CameraModel, without_zeros
-from vslam.datasets.depth_cameras import FPS, TIMEOUT_S, DepthCamera, Grabbed, maker_package
+from vslam.calibration.models import Array, Calibration, CameraModel, without_zeros
+from vslam.datasets.depth_cameras import (
+    FPS,
+    IMU_HZ,
+    TIMEOUT_S,
+    DepthCamera,
+    Grabbed,
+    calibration_of_imu,
+    maker_package,
+)
+from vslam.datasets.imu import Imu, SplitSamples
 from vslam.support.errors import InputError
 
 _SIZE = 848, 480  # recommended by Intel for the depth of these cameras
@@ -52,10 +65,11 @@ def open_realsense(serial: str, sensor: str | None) -> DepthCamera:
         if depth_sensor.supports(rs.option.emitter_enabled):
             depth_sensor.set_option(rs.option.emitter_enabled, float(sensor == "rgbd"))
         profile = pipeline.start(config)
-        with ExitStack() as failed:
-            failed.callback(pipeline.stop)
+        with ExitStack() as opened:
+            opened.callback(pipeline.stop)
             calibration = _calibration(rs, profile, depth_sensor, sensor, serial)
-            failed.pop_all()  # the pipeline is only stopped if the calibration fails
+            imu, warnings = _start_imu(rs, profile, sensor, serial, opened.callback)
+            stop = opened.pop_all().close  # from here on, DepthCamera stops the device
     except RuntimeError as error:
         raise InputError(
             f"realsense {serial}: {error}; connect it to a USB 3 port, and close other programs "
@@ -83,7 +97,7 @@ def open_realsense(serial: str, sensor: str | None) -> DepthCamera:
         except RuntimeError:  # the device was unplugged
             return None
 
-    return DepthCamera("realsense", serial, calibration, grab, pipeline.stop)
+    return DepthCamera("realsense", serial, calibration, grab, stop, imu, warnings)
 
 
 def _device(rs: Any, serial: str) -> Any:
@@ -105,10 +119,7 @@ def _calibration(rs: Any, profile: Any, depth_sensor: Any, sensor: str, serial: 
             profile.get_stream(rs.stream.infrared, side).as_video_stream_profile()
             for side in (1, 2)
         )
-        extrinsics = right.get_extrinsics_to(left)
-        T_left_right = np.eye(4)
-        T_left_right[:3, :3] = np.reshape(extrinsics.rotation, (3, 3), order="F")
-        T_left_right[:3, 3] = extrinsics.translation
+        T_left_right = _transformation(right.get_extrinsics_to(left))
         first, second = (_model(rs, side.get_intrinsics(), source) for side in (left, right))
         return Calibration(first, second, T_left_right, source=source)
     colour = profile.get_stream(rs.stream.color).as_video_stream_profile()
@@ -120,6 +131,50 @@ def _calibration(rs: Any, profile: Any, depth_sensor: Any, sensor: str, serial: 
         baseline = depth_sensor.get_option(rs.option.stereo_baseline) / 1000
     scale = 1.0 / depth_sensor.get_depth_scale()
     return Calibration(model, depth_scale=scale, virtual_baseline=baseline, source=source)
+
+
+def _transformation(extrinsics: Any) -> Array:
+    """Return the ``(4, 4)`` matrix that maps points of the first stream to the second one."""
+    T = np.eye(4)
+    T[:3, :3] = np.reshape(extrinsics.rotation, (3, 3), order="F")
+    T[:3, 3] = extrinsics.translation
+    return T
+
+
+def _start_imu(
+    rs: Any, profile: Any, sensor: str, serial: str, on_stop: Callable[[Callable[[], None]], object]
+) -> tuple[Imu | None, tuple[str, ...]]:
+    """Start the IMU if the device has one. If it cannot be started, a warning says why."""
+    name = f"realsense {serial}"
+    motion = next((s for s in profile.get_device().query_sensors() if s.is_motion_sensor()), None)
+    if motion is None:
+        return None, ()
+    chosen, samples = [], SplitSamples()
+    for stream in (rs.stream.gyro, rs.stream.accel):
+        offered = [p for p in motion.get_stream_profiles() if p.stream_type() == stream]
+        if not offered:
+            return None, ()
+        chosen.append(min(offered, key=lambda one: abs(one.fps() - IMU_HZ)))
+
+    def take(frame: Any) -> None:  # called in a thread of librealsense
+        data = frame.as_motion_frame().get_motion_data()
+        turns = frame.get_profile().stream_type() == rs.stream.gyro
+        add = samples.add_rate if turns else samples.add_force
+        add(frame.get_timestamp() / 1000, data.x, data.y, data.z)
+
+    left = (rs.stream.infrared, 1) if sensor == "stereo" else (rs.stream.color,)
+    try:
+        if motion.supports(rs.option.global_time_enabled):  # the clock of the images
+            motion.set_option(rs.option.global_time_enabled, 1.0)
+        T_imu_camera = _transformation(profile.get_stream(*left).get_extrinsics_to(chosen[0]))
+        motion.open(chosen)
+        on_stop(motion.close)
+        motion.start(take)
+        on_stop(motion.stop)
+    except RuntimeError as error:
+        return None, (f"{name}: the IMU is not used, because it cannot be started ({error}).",)
+    calibration = calibration_of_imu(T_imu_camera)
+    return Imu(name, samples.read, calibration, live=True), ()
 
 
 def _model(rs: Any, intrinsics: Any, source: str) -> CameraModel:

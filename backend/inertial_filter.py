@@ -199,7 +199,8 @@ def _corrected(state: InertialState, H: Matrix, error: Matrix, noise: Matrix) ->
     """Correct a state with a measurement ``H e`` of its error (Joseph's form)."""
     P = state.covariance
     S = H @ P @ H.T + noise
-    K = np.linalg.solve(S, H @ P).T
+    solved = np.linalg.solve(S, np.column_stack([H @ P, error]))
+    K = solved[:, :N].T
     x = K @ error
     keep = np.eye(N) - K @ H
     P = keep @ P @ keep.T + K @ noise @ K.T
@@ -218,4 +219,4 @@ def _corrected(state: InertialState, H: Matrix, error: Matrix, noise: Matrix) ->
         state.bias + x[BIAS],
         0.5 * (P + P.T),
     )
-    return Correction(corrected, float(error @ np.linalg.solve(S, error)))
+    return Correction(corrected, float(error @ solved[:, N]))

@@ -29,7 +29,7 @@ from vslam.support.workers import Workers
 from vslam.types.camera import Camera, DepthImage, Image
 from vslam.types.context import Context
 from vslam.types.features import Extracted, TrackResult
-from vslam.types.imu import ImuCalibration, tidied
+from vslam.types.imu import ImuCalibration
 from vslam.types.loops import LoopCorrection, LoopEdge
 from vslam.types.map import Map
 from vslam.types.track import Track
@@ -257,7 +257,7 @@ class Slam:
         Raises:
             ValueError: the shape is wrong.
         """
-        self._session.add_imu(tidied(samples).samples)
+        self._session.add_imu(samples)
 
     def step_features(
         self,

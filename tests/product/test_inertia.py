@@ -126,6 +126,20 @@ def test_in_turns_the_walk_after_the_dark_is_not_lost():
     assert ends["alone"][0] > 0.5
 
 
+def test_one_frame_in_the_light_corrects_what_the_dark_has_spoilt():
+    """The samples of a second of darkness are wrong by 0.2 m/s^2. One frame then shows it."""
+    rows = samples().copy()
+    rows[(rows[:, 0] > TIMES[20]) & (rows[:, 0] < TIMES[40]), 4] += 0.2
+    results = walk(slam_with(), rows, dark=[*range(20, 40), *range(41, LAST)])
+    assert results[40].state == TrackingState.OK
+    first, second = (
+        inverse(inverse(TRUTH[a]) @ TRUTH[b]) @ inverse(results[a].T_wc) @ results[b].T_wc
+        for a, b in ((19, 39), (40, 58))
+    )
+    assert np.linalg.norm(first[:3, 3]) > 0.08
+    assert np.linalg.norm(second[:3, 3]) < 0.04  # 0.17 m if the velocity stays wrong
+
+
 def test_a_slow_camera_gets_gravity_from_more_than_a_second():
     slam = slam_with()
     rows = samples()

@@ -17,6 +17,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vslam.backend.inertial_filter import (
     FALL,
@@ -28,10 +29,11 @@ from vslam.backend.inertial_filter import (
     corrected_by_pose,
     corrected_by_rest,
     in_another_world,
-    propagated,
+    inflated,
+    moved,
 )
 from vslam.backend.inertial_start import MAX_MISFIT, GravityState, PoseStretch, find_gravity
-from vslam.backend.preintegration import cross_matrix
+from vslam.backend.preintegration import cross_matrix, preintegrate
 from vslam.types.frame_poses import PoseRun
 from vslam.types.geometry import Matrix, inverse
 from vslam.types.imu import (
@@ -90,8 +92,8 @@ def is_refused(inertia: Inertia) -> bool:
     return inertia.disagreements >= MOST_DISAGREEMENTS
 
 
-def with_samples(inertia: Inertia, samples: Matrix, kept_s: float = KEPT_S) -> Inertia:
-    """Add ``(N, 7)`` samples, which may be late or repeated. Old samples are forgotten.
+def with_samples(inertia: Inertia, samples: ArrayLike, kept_s: float = KEPT_S) -> Inertia:
+    """Add ``(N, 7)`` samples in any order (``tidied``). Old samples are forgotten.
 
     Args:
         kept_s: for how many seconds samples are kept.
@@ -99,7 +101,11 @@ def with_samples(inertia: Inertia, samples: Matrix, kept_s: float = KEPT_S) -> I
     Raises:
         ValueError: the shape is not ``(N, 7)``.
     """
-    known = tidied(np.concatenate([inertia.samples, samples])).samples
+    known, new = inertia.samples, tidied(samples).samples
+    late = len(known) > 0 and len(new) > 0 and not new[0, 0] > known[-1, 0]
+    known = np.concatenate([known, new])
+    if late:
+        known = tidied(known).samples
     if len(known):
         since = known[-1, 0] - kept_s
         if inertia.state is not None:
@@ -112,15 +118,12 @@ def predicted_state(
     inertia: Inertia, timestamp: float, calibration: ImuCalibration
 ) -> InertialState | None:
     """Return the state at the time of the next frame; None if it is unknown."""
-    state, times = inertia.state, inertia.samples[:, 0]
-    if state is None or not len(times) or not timestamp > state.timestamp:
+    state = inertia.state
+    if state is None or not len(inertia.samples) or not timestamp > state.timestamp:
         return None
-    first = max(int(np.searchsorted(times, state.timestamp, "right")) - 1, 0)
-    last = int(np.searchsorted(times, timestamp)) + 1
-    known = np.concatenate([[state.timestamp], times[first:last], [timestamp]])
-    if np.diff(np.sort(known)).max() > LONGEST_GAP:
-        return None
-    return propagated(state, inertia.samples, timestamp, calibration.noise)
+    noise = inflated(calibration.noise)
+    motion = preintegrate(inertia.samples, state.timestamp, timestamp, noise, state.bias)
+    return moved(state, motion, noise) if motion.longest_gap <= LONGEST_GAP else None
 
 
 def tracked(
@@ -145,8 +148,7 @@ def tracked(
         return inertia
     if predicted is None:  # unknown, or samples are missing
         return _started(_collected(inertia, timestamp, T_odom_camera), calibration)
-    floor = np.repeat([SIGMA_M**2, SIGMA_RAD**2], 3)
-    noise = POSE_INFLATION * covariance + np.diag(floor)
+    noise = _noise(covariance)
     found = corrected_by_pose(predicted, T_odom_camera, noise, calibration.T_imu_camera)
     if not found.chi2 <= IMPLAUSIBLE:
         if inertia.refused + 1 >= MOST_REFUSED:
@@ -165,16 +167,33 @@ def found_again(
     inertia: Inertia,
     predicted: InertialState | None,
     T_odom_camera: Matrix,
+    covariance: Matrix,
     calibration: ImuCalibration,
+    *,
+    T_odom_seen: Matrix | None,
 ) -> Inertia:
     """Return what is known after a frame that was found in the map again.
 
-    The odometry continues from the predicted pose, so its frame is defined anew by this pose.
+    How far the camera has moved since it was lost corrects the velocity and the biases with which
+    the IMU carried it. The odometry continues from the predicted pose, so its frame is then defined
+    anew by this pose.
+
+    Args:
+        T_odom_camera: ``(4, 4)`` predicted pose of the frame.
+        covariance: ``(6, 6)`` of the pose that the images gave.
+        T_odom_seen: ``(4, 4)`` this pose, in the frame of the odometry before; None if the frame
+            was found at another place than predicted, whose distance has errors of its own.
     """
     if predicted is None:
         return replace(_forgotten(inertia), carried_s=0.0)
+    state = predicted
+    if T_odom_seen is not None:
+        noise = _noise(covariance)
+        found = corrected_by_pose(predicted, T_odom_seen, noise, calibration.T_imu_camera)
+        if found.chi2 <= IMPLAUSIBLE:
+            state = found.state
     T_odom_imu = T_odom_camera @ inverse(calibration.T_imu_camera)
-    return replace(inertia, state=anchored(predicted, T_odom_imu), carried_s=0.0, refused=0)
+    return replace(inertia, state=anchored(state, T_odom_imu), carried_s=0.0, refused=0)
 
 
 def lost(inertia: Inertia, predicted: InertialState | None, seconds: float) -> Inertia:
@@ -270,6 +289,12 @@ def gravity_direction(state: InertialState, calibration: ImuCalibration) -> Grav
     across = float(np.trace(A @ state.covariance[np.ix_(errors, errors)] @ A.T))
     direction: Matrix = calibration.T_imu_camera[:3, :3].T @ gravity
     return GravityDirection(direction, np.sqrt(across / 2.0))
+
+
+def _noise(covariance: Matrix) -> Matrix:
+    """Return the ``(6, 6)`` covariance with which a pose of the images corrects the state."""
+    noise: Matrix = POSE_INFLATION * covariance
+    return noise + np.diag(np.repeat([SIGMA_M**2, SIGMA_RAD**2], 3))
 
 
 def _forgotten(inertia: Inertia) -> Inertia:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vslam.backend.inertial_filter import camera_pose
 from vslam.backend.inertial_start import GravityState
@@ -143,7 +144,7 @@ class Motion:
         self.state = MotionState(odometry, 0, inertia)
         return self._with_gravity(track)
 
-    def add_samples(self, samples: Matrix) -> None:
+    def add_samples(self, samples: ArrayLike) -> None:
         """Add samples of the IMU, see ``Slam.add_imu``."""
         kept_s = SCALE_STRETCHES[0] + 1.0 if self.seeks_scale else KEPT_S
         inertia = with_samples(self.state.inertia, samples, kept_s)
@@ -213,7 +214,10 @@ class Motion:
             return inertia
         T_odom_camera, local = odometry.T_odom_camera, odometry.now.local
         if found_again:
-            return anew(inertia, inertial, T_odom_camera, self._imu)
+            T_odom_seen = None
+            if track.by is not By.PLACE:
+                T_odom_seen = self._followed(track, track.T_cw, predicted).T_odom_camera
+            return anew(inertia, inertial, T_odom_camera, local, self._imu, T_odom_seen=T_odom_seen)
         return tracked(
             inertia, inertial, track.timestamp, T_odom_camera, local, self._imu,
             stands_still=track.by is By.STANDSTILL,

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vslam.config import changed_thresholds
 from vslam.frontend.images import Images
@@ -34,7 +35,7 @@ from vslam.types.camera import same_camera
 from vslam.types.context import Context
 from vslam.types.features import TrackingState, TrackResult
 from vslam.types.frame_poses import FrameTable
-from vslam.types.geometry import Matrix, inverse, orthonormalised, se3_log
+from vslam.types.geometry import inverse, orthonormalised, se3_log
 from vslam.types.imu import GRAVITY, ImuCalibration
 from vslam.types.map import Map
 from vslam.types.states import Checkpoint, ClosingState, MotionState
@@ -199,7 +200,7 @@ class Session:
         soon = self._mode.due if track.by_patches else track.index + 2
         return self._end(updated, clock, soon)
 
-    def add_imu(self, samples: Matrix) -> None:
+    def add_imu(self, samples: ArrayLike) -> None:
         """Add samples of the IMU (``Slam.add_imu``)."""
         self._motion.add_samples(samples)
 

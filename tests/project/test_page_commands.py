@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = [path for path in sorted(DOCS.rglob("*.md")) if path.name != "commands.md"]
 PAGES += [*sorted(ROOT.glob("*.md")), ROOT / "loopclosure" / "vocabulary.md"]
-FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+FENCE = re.compile(r"^```(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 SPAN = re.compile(r"`(vslam [^`\n]+)`")
 OF_PLUGINS = "thumbnail", "frames", "haze"  # the names in docs/howto/plugins.md
 USAGE_ERROR: Any = typer.BadParameter.__base__  # typer does not export it

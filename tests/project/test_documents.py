@@ -70,8 +70,14 @@ def test_a_missing_file_would_be_seen():
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=name)
-def test_no_path_of_a_machine(document):
-    assert re.findall(r"(?<![\w.}$~])/(?:home|root|work|Users)/\S+", document.read_text()) == []
+def test_no_path_of_a_machine_and_no_conflict_of_a_merge(document):
+    text = document.read_text()
+    assert re.findall(r"(?<![\w.}$~])/(?:home|root|work|Users)/\S+", text) == []
+    assert re.findall(r"^(?:<{7}|>{7}) .*", text, re.MULTILINE) == []
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().split()) <= 900
 
 
 def test_tests_that_documents_name_exist():

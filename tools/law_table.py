@@ -21,7 +21,8 @@ def table() -> str:
         numbers = (f"{x:g}" for x in (kind.default, kind.weakest, kind.strongest))
         drawn = "yes" if kind.drawn else "no"
         needs = " ".join(kind.needs)
-        writer.writerow([name, kind.unit, *numbers, drawn, needs, kind.sides, kind.about])
+        sides = "" if kind.of_imu else kind.sides
+        writer.writerow([name, kind.unit, *numbers, drawn, needs, sides, kind.about])
     return text.getvalue()
 
 

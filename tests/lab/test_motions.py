@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +11,13 @@ from inertial import ADIS16448
 from typer.testing import CliRunner
 
 from vslam.backend.preintegration import preintegrate, so3_log
+from vslam.cli.console import Console
+from vslam.cli.drive import _open
 from vslam.cli.main import every_command
 from vslam.datasets import open_sequence
 from vslam.datasets.kitti import open_kitti
 from vslam.run.imu import usable_imu
+from vslam.run.options import RunOptions
 from vslam.support.errors import InputError
 from vslam.types.camera import Camera
 from vslam.types.geometry import inverse
@@ -165,3 +169,12 @@ def test_synth_writes_the_samples_beside_the_images_and_a_run_finds_them(cache):
 def test_other_layouts_have_no_imu(other, tmp_path):
     words = ["synth", "room", "--imu", other, "--out", str(tmp_path / "out")]
     assert "--imu: leave out" in str(CliRunner().invoke(every_command(), words).exception)
+
+
+def test_a_run_gets_the_perturbed_samples(cache):
+    options = RunOptions(
+        dataset="synthetic", seq="room+imu", max_frames=2, perturb="imu-delay:30", seed=0
+    )
+    source, _ = _open(options, Console(shown=False), SimpleNamespace(start=lambda: None))
+    expected = simulated_imu(built_in_motion("room", 0), 0).read()
+    np.testing.assert_allclose(source.imu.recorded.samples[:, 0], expected[:, 0] + 0.03)

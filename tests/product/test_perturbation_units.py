@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from vslam.datasets.frames import Source, stored_frames
+from vslam.datasets.imu import Imu
 from vslam.datasets.perturbation import LAWS, Scene, laws_for, parse_perturbation
 from vslam.datasets.perturbation.depth import dense_depths, disparity
 from vslam.datasets.perturbation.kinds import Pair
@@ -18,9 +20,14 @@ from vslam.datasets.perturbation.motion import line_kernel
 from vslam.datasets.perturbation.weather import AIRLIGHT, drops_per_m3, glass_drops
 from vslam.support.errors import DroppedFrameError, InputError
 from vslam.types.camera import Camera, ImageMap
+from vslam.types.imu import GRAVITY, ImuNoise
 
 CAMERA = Camera(400.0, 400.0, 160.0, 80.0, 0.5, 320, 160)
 RATE = 0.4  # rad/s, to the right
+NOISE = ImuNoise(1e-4, 1e-3)
+SAMPLES = np.column_stack(
+    [5.0 + 0.005 * np.arange(6000), np.tile([0.0, RATE, 0.0, 0.0, -GRAVITY, 0.0], (6000, 1))]
+)
 
 
 def texture(seed: int, shape: tuple[int, int] = (160, 480)) -> np.ndarray:
@@ -57,6 +64,7 @@ def drive_of(camera: Camera = CAMERA, *, poses: bool = True) -> Source:
         camera=camera,
         stored=stored_frames(timestamps, read),
         ground_truth=T_wc if poses else None,
+        imu=Imu("imu.csv", lambda: SAMPLES, noise=NOISE),
     )
 
 
@@ -408,6 +416,72 @@ def test_what_the_data_lack_is_said():
     assert laws_for(drive_of()) == (list(LAWS), {})
     assert list(unfit) == [law for law in LAWS if law not in fit]
     assert unfit["fog"].startswith("--perturb fog: needs stereo")
+
+
+def samples_under(spec: str, seed: int = 0) -> np.ndarray:
+    drive = drive_of()
+    return parse_perturbation(spec, seed).bound_to(drive).of_imu(drive.imu).recorded.samples
+
+
+def test_noise_of_the_imu_is_a_multiple_of_its_densities():
+    added = (samples_under("imu-noise:20") - SAMPLES)[:, 1:]
+    density = added.std(axis=0) * np.sqrt(0.005)
+    np.testing.assert_allclose(density, 20 * np.repeat([NOISE.gyro, NOISE.accel], 3), rtol=0.05)
+    assert np.abs(np.corrcoef(added.T) - np.eye(6)).max() < 0.06
+
+
+def test_biases_of_the_imu_have_the_lengths_of_their_units():
+    added = (samples_under("imu-bias:2", 1) - SAMPLES)[:, 1:]
+    np.testing.assert_allclose(added, added[:1].repeat(len(added), axis=0), atol=1e-12)
+    assert np.degrees(np.linalg.norm(added[0, :3])) == pytest.approx(2.0)
+    assert np.linalg.norm(added[0, 3:]) == pytest.approx(0.2)
+    other = (samples_under("imu-bias:2", 2) - SAMPLES)[0, 1:]
+    assert np.linalg.norm(other - added[0]) > 0.01
+
+
+def test_samples_of_the_imu_are_missing_once_in_ten_seconds():
+    kept = samples_under("imu-gap:1.5", 3)
+    steps = np.diff(kept[:, 0])
+    assert (steps > 0.006).sum() == 3
+    assert steps.max() == pytest.approx(1.505, abs=0.006)
+    begun = kept[:-1][steps > 0.006, 0] - SAMPLES[0, 0]
+    assert [int(t // 10) for t in begun] == [0, 1, 2]
+    assert begun[0] > 0.99
+
+
+def test_a_late_imu_has_later_times_only():
+    late = samples_under("imu-delay:-30")
+    np.testing.assert_allclose(late[:, 0], SAMPLES[:, 0] - 0.03)
+    np.testing.assert_array_equal(late[:, 1:], SAMPLES[:, 1:])
+
+
+def test_a_turned_imu_measures_the_same_lengths_along_other_axes():
+    turned = samples_under("imu-axes:12", 4)
+    for at in (slice(1, 4), slice(4, 7)):
+        lengths = np.linalg.norm(turned[:, at], axis=1)
+        np.testing.assert_allclose(lengths, np.linalg.norm(SAMPLES[:, at], axis=1))
+    cosines = [turned[0, at] @ SAMPLES[0, at] / (SAMPLES[0, at] @ SAMPLES[0, at])
+               for at in (slice(1, 4), slice(4, 7))]  # fmt: skip
+    angles = np.degrees(np.arccos(cosines))
+    assert angles.max() <= 12.0 + 1e-9  # the axis need not be perpendicular
+    assert angles.max() > 1.0
+
+
+def test_laws_of_the_imu_leave_the_images_alone_and_need_samples():
+    drive = drive_of()
+    mixed = parse_perturbation("imu-gap:1,noise:1,imu-delay:5", 0).bound_to(drive)
+    assert mixed.name == "imu-gap:1,noise:1,imu-delay:5"
+    alone = parse_perturbation("noise:1", 0).bound_to(drive)
+    images = drive.read(3)
+    for one, other in zip(mixed.apply(3, 0.3, *images), alone.apply(3, 0.3, *images), strict=True):
+        np.testing.assert_array_equal(one, other)
+    both = mixed.of_imu(drive.imu).recorded.samples
+    np.testing.assert_allclose(both[:, 0] - 0.005, samples_under("imu-gap:1")[:, 0])
+    with pytest.raises(InputError, match="--perturb imu-bias: needs the recorded samples"):
+        parse_perturbation("imu-bias", 0).bound_to(replace(drive, imu=None))
+    live = replace(drive.imu, live=True)
+    with pytest.raises(InputError, match="--perturb imu-bias: needs the recorded samples"):
+        parse_perturbation("imu-bias", 0).bound_to(replace(drive, imu=live))
 
 
 def test_a_stream_has_no_next_frame():

@@ -137,6 +137,8 @@ def _open(
     perturbation = parse_perturbation(options.perturb, options.seed)
     source = open_given(options, console, kernels.start)
     perturbation.bound_to(source)
+    if source.imu is not None:
+        source = replace(source, imu=perturbation.of_imu(source.imu))
     return source, perturbation
 
 

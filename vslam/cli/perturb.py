@@ -73,7 +73,8 @@ def preview(
         for why in unfit.values():
             typer.echo(f"left out: {why}", err=True)
         shown = [min(10, len(sequence) - 1)]
-        specs = [f"{law}:{law_kind(law).default:g}" for law in fit]
+        kinds = {law: law_kind(law) for law in fit}
+        specs = [f"{law}:{kind.default:g}" for law, kind in kinds.items() if not kind.of_imu]
         image = sheet_of_laws(sequence, specs, shown[0], seed)
     else:
         shown = np.unique(np.linspace(0, len(sequence) - 1, frames).round().astype(int)).tolist()

@@ -57,11 +57,20 @@ yaw           Arc minutes by which the right camera is turned right, compared wi
 pitch         Arc minutes by which the right camera is turned up, compared with the calibration.
 black_right   % of the seconds in which the right image is black.
 black_left    % of the seconds in which the left image is black.
+imu-noise     White noise is added to the samples of the IMU: s times the densities of its
+              calibration.
+imu-bias      Bias of the gyroscope (degrees/s) in a random direction. That of the accelerometer, in
+              another direction, is 0.1 m/s^2 for each degree/s.
+imu-gap       Length (s) of a gap in the samples, which happens once in every ten seconds.
+imu-delay     ms by which the times of the samples are late.
+imu-axes      Angle (degrees) by which the IMU is turned about a random axis, compared with the
+              calibration.
 ============  ======================================================================================
 
 Each law rounds its result and clips it to 8 bits.
 
-The laws from stereo_gain to black_left change the image of only one camera. All other laws change
+The laws of the IMU need recorded samples, and leave the images unchanged. The laws from stereo_gain
+to black_left change the image of only one camera. All other laws change
 both images in the same way. However, the random numbers for noise, night, shot, impulse, dirt and
 drops on the glass are drawn separately for each camera.
 

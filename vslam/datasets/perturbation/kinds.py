@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from vslam.datasets.frames import Source
 from vslam.support.errors import InputError
 from vslam.types.camera import Camera, DepthImage, Image
+from vslam.types.geometry import Matrix
+from vslam.types.imu import ImuNoise
 
 RandomStream = tuple[int, int]
 """The user's seed, and a number for the law. All seeds of the law begin with these two numbers."""
@@ -56,6 +58,10 @@ class Pair:
 
 PairLaw = Callable[[Pair], Pair]
 
+ImuLaw = Callable[[Matrix, ImuNoise], Matrix]
+"""A function ``(samples, noise) -> samples`` of all ``(N, 7)`` samples of an IMU, N > 1, and of the
+densities of its noise."""
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -67,27 +73,31 @@ class Scene:
         T_wc: ``(N, 4, 4)`` true camera poses, NaN where unknown; None if there are none.
         read: function that reads the images of the frame with a given index. None if the source
             cannot seek.
+        imu: whether there are recorded samples of an IMU.
     """
 
     camera: Camera
     times: NDArray[np.float64] | None = None
     T_wc: NDArray[np.float64] | None = None
     read: Callable[[int], tuple[Image, Image | DepthImage | None]] | None = None
+    imu: bool = False
 
     @classmethod
     def of(cls, source: Source) -> Scene:
+        imu = source.imu is not None and not source.imu.live
         if not source.seekable:
-            return cls(source.camera)
+            return cls(source.camera, imu=imu)
         times = source.timestamps
-        return cls(source.camera, times - times[:1], source.ground_truth, source.read)
+        return cls(source.camera, times - times[:1], source.ground_truth, source.read, imu)
 
 
-Need = Literal["right", "depth", "neighbours"]
+Need = Literal["right", "depth", "neighbours", "imu"]
 _UNMET: dict[Need, str] = {
     "right": "needs stereo images, but this source has no right image",
     "depth": "needs stereo or depth images, but this source has one camera",
     "neighbours": "needs the next frame, which a video, bag or camera cannot provide; use a data "
     "set or a folder of images",
+    "imu": "needs the recorded samples of an IMU, which this source does not have",
 }
 
 
@@ -101,6 +111,7 @@ def check_need(law: str, need: Need, scene: Scene) -> None:
         "right": scene.camera.sensor == "stereo",
         "depth": not scene.camera.monocular,
         "neighbours": scene.read is not None,
+        "imu": scene.imu,
     }
     if not has[need]:
         raise InputError(f"--perturb {law}: {_UNMET[need]}.")
@@ -134,7 +145,8 @@ class LawKind:
 
     Attributes:
         make: function that makes the perturbation: ``(strength, stream) -> Law``. If ``of_scene``
-            is set, it is ``(strength, stream, scene) -> PairLaw``.
+            is set, it is ``(strength, stream, scene) -> PairLaw``. If ``of_imu`` is set, it is
+            ``(strength, stream) -> ImuLaw``.
         unit: unit of the strength.
         default: strength that is used if none is given.
         weakest: weakest strength that ``vslam stress`` tries.
@@ -150,9 +162,10 @@ class LawKind:
         of_scene: whether the perturbation needs data of the source, in addition to the images of a
             frame.
         sides: ``both`` if both images are changed, ``one`` for a fault of the stereo rig.
+        of_imu: whether the perturbation changes the samples of the IMU instead of the images.
     """
 
-    make: Callable[..., Law | PairLaw]
+    make: Callable[..., Law | PairLaw | ImuLaw]
     unit: str
     default: float
     weakest: float
@@ -165,6 +178,7 @@ class LawKind:
     needs: tuple[Need, ...] = ()
     of_scene: bool = False
     sides: Literal["both", "one"] = "both"
+    of_imu: bool = False
 
     def law(self, name: str, strength: float, stream: RandomStream) -> PairLaw | SceneLaw:
         if not self.of_scene:

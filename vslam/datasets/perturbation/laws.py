@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import isfinite
 from zlib import crc32
@@ -11,10 +11,22 @@ from zlib import crc32
 import numpy as np
 
 from vslam.datasets.frames import Source, TimedFrame
-from vslam.datasets.perturbation.kinds import EachSide, LawKind, Pair, PairLaw, Scene, SceneLaw
+from vslam.datasets.imu import Imu
+from vslam.datasets.perturbation.kinds import (
+    EachSide,
+    ImuLaw,
+    LawKind,
+    Pair,
+    PairLaw,
+    Scene,
+    SceneLaw,
+    check_need,
+)
 from vslam.datasets.perturbation.registry import LAWS, all_laws
 from vslam.support.errors import DroppedFrameError, InputError, did_you_mean
 from vslam.types.camera import DepthImage, Image, ImageMap
+from vslam.types.geometry import Matrix
+from vslam.types.imu import ImuNoise, tidied
 
 
 @dataclass(frozen=True)
@@ -25,12 +37,14 @@ class Perturbation:
 
     Attributes:
         name: canonical spelling, for example ``none`` or ``brightness:1.5,blur:0.5``.
-        laws: the laws, in the order in which they are applied. `vslam.datasets.perturbation`
-            describes them.
+        laws: the laws of images, in the order in which they are applied.
+            `vslam.datasets.perturbation` describes them.
+        imu_laws: the laws of an IMU by name, in the order in which they are applied.
     """
 
     name: str
     laws: tuple[PairLaw | SceneLaw, ...] = ()
+    imu_laws: tuple[tuple[str, ImuLaw], ...] = ()
 
     def bound_to(self, source: Source) -> Perturbation:
         """Prepare the perturbation for one source, because some laws use its depth or its poses.
@@ -38,11 +52,23 @@ class Perturbation:
         Raises:
             InputError: the source does not have the data that the perturbation needs.
         """
-        if not any(isinstance(law, SceneLaw) for law in self.laws):
+        if not self.imu_laws and not any(isinstance(law, SceneLaw) for law in self.laws):
             return self
         scene = Scene.of(source)
+        for name, _ in self.imu_laws:
+            check_need(name, "imu", scene)
         laws = (law.bound_to(scene) if isinstance(law, SceneLaw) else law for law in self.laws)
-        return Perturbation(self.name, tuple(laws))
+        return replace(self, laws=tuple(laws))
+
+    def of_imu(self, imu: Imu) -> Imu:
+        """Return an IMU whose samples are perturbed when they are read.
+
+        Args:
+            imu: a recording.
+        """
+        if not self.imu_laws:
+            return imu
+        return replace(imu, read=partial(_perturbed_samples, imu, self.imu_laws))
 
     def apply(
         self, index: int, t: float, left: Image, second: Image | DepthImage | None
@@ -97,13 +123,21 @@ def parse_perturbation(spec: str, seed: int) -> Perturbation:
             raise InputError(f"--perturb {spec}: {law} is given twice; give it once.")
         default = known[law].default
         strengths[law] = _parse_strength(spec, known[law], strength) if ":" in item else default
+    streams = {law: (seed, crc32(law.encode())) for law in strengths}
+    of_images = {law: s for law, s in strengths.items() if not known[law].of_imu}
+    of_imu = {law: s for law, s in strengths.items() if known[law].of_imu}
     return Perturbation(
         ",".join(f"{law}:{strength:g}" for law, strength in strengths.items()),
-        tuple(
-            known[law].law(law, strength, (seed, crc32(law.encode())))
-            for law, strength in strengths.items()
-        ),
+        tuple(known[law].law(law, s, streams[law]) for law, s in of_images.items()),
+        tuple((law, known[law].make(s, streams[law])) for law, s in of_imu.items()),  # type: ignore[misc]
     )
+
+
+def _perturbed_samples(imu: Imu, laws: tuple[tuple[str, ImuLaw], ...]) -> Matrix:
+    samples, noise = tidied(imu.read()).samples, imu.noise or ImuNoise()
+    for _, law in laws:
+        samples = law(samples, noise) if len(samples) > 1 else samples
+    return samples
 
 
 def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Iterator[TimedFrame]:

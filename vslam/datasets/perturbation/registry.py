@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vslam.datasets.perturbation import glass, light, motion, sensor, stereo, weather
+from vslam.datasets.perturbation import glass, inertial, light, motion, sensor, stereo, weather
 from vslam.datasets.perturbation.kinds import Law, LawKind
 from vslam.support.errors import InputError, UnreadableImageError
 from vslam.support.plugins import PERTURBATIONS, PlugIn, find_plugins
@@ -72,6 +72,7 @@ LAWS: dict[str, LawKind] = {
     **{name: light.KINDS[name] for name in ("bias", "contrast")},
     **{name: sensor.KINDS[name] for name in ("shot", "impulse", "bits")},
     **stereo.KINDS,
+    **inertial.KINDS,
 }
 """vslam's own laws, in the order of the documentation."""
 

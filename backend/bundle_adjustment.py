@@ -338,6 +338,13 @@ def reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse):
                         target[j] -= y0 * w[0, j] + y1 * w[1, j] + y2 * w[2, j]
 
 
+@kernel
+def reduced_system(n_free, observations, equations, damping, S, rhs, V_inverse):
+    """Do the same as ``reduce_points``, for callers that are not kernels. ``S`` and ``rhs`` may
+    have further unknowns after the cameras."""
+    reduce_points(n_free, observations, equations, damping, S, rhs, V_inverse)
+
+
 @inner_kernel
 def invert_damped(V, damping, N):
     """Damp the diagonal of a point's ``(3, 3)`` block, and write the inverse of the block into

@@ -25,6 +25,7 @@ from vslam.backend.local_mapping import adjust_locally, assemble, map_keyframe
 from vslam.config import StereoConfig
 from vslam.types.context import Context
 from vslam.types.features import shifted_columns
+from vslam.types.imu import InertialWindow
 from vslam.types.map import Map
 from vslam.types.map_kernels import collect_landmarks
 
@@ -40,15 +41,17 @@ VARIANCE = 3.0
 TOLERANCE = 1e-5  # least relative decrease of the cost; STEP changes it by some thousandths
 
 
-def map_and_calibrate(map_: Map, keyframe: int, context: Context) -> None:
+def map_and_calibrate(
+    map_: Map, keyframe: int, context: Context, inertial: InertialWindow | None = None
+) -> None:
     """Run local mapping for a new keyframe (``map_keyframe``). For a stereo camera, the disparity
     offset of the map is updated after every ``_OFFSET_KEYFRAMES`` keyframes."""
-    map_keyframe(map_, keyframe, context)
+    map_keyframe(map_, keyframe, context, inertial)
     if context.config.stereo.offset_sigma > 0.0 and context.camera.sensor == "stereo":
-        _calibrate(map_, keyframe, context)
+        _calibrate(map_, keyframe, context, inertial)
 
 
-def _calibrate(map_: Map, keyframe: int, context: Context) -> None:
+def _calibrate(map_: Map, keyframe: int, context: Context, inertial: InertialWindow | None) -> None:
     config = context.config.stereo
     known, window = map_.scalars, map_.living_keyframes()
     window = window[window > max([known.calibrated_until, *(k - 1 for k in map_.restarts)])]
@@ -70,7 +73,7 @@ def _calibrate(map_: Map, keyframe: int, context: Context) -> None:
     )
     a, n = map_.arrays, map_.n_rows
     a.u_right[:n] = shifted_columns(a.u_right[:n], a.xy[:n, 0], change)
-    adjust_locally(map_, keyframe, context)
+    adjust_locally(map_, keyframe, context, inertial)
 
 
 def offset_sigma(information: float, config: StereoConfig) -> float:

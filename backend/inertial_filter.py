@@ -29,7 +29,7 @@ from vslam.types.imu import GRAVITY, ImuNoise, InertialState
 
 N = 18
 TURN, PLACE, SPEED, FALL, GYRO, ACCEL = (slice(k, k + 3) for k in range(0, N, 3))
-BIAS = slice(12, N)
+BIAS, FALL_AND_BIAS = slice(12, N), slice(9, N)
 # The world frame of the filter is that of the odometry, whose direction drifts. In rad/sqrt(s); at
 # 10 m/s, this is 0.3 degrees in 100 m, as the worst of KITTI's sequences.
 DRIFT = 1.5e-3

@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.fusion import fuse_neighbourhood
+from vslam.backend.inertial_adjustment import InertialChain, adjust_with_imu, chain_of
 from vslam.backend.triangulation import triangulate_with_neighbours
 from vslam.config import Config
 from vslam.support.kernels import kernel
 from vslam.types.camera import DISPARITY_WEIGHT, Camera
 from vslam.types.context import Context
+from vslam.types.imu import InertialWindow
 from vslam.types.map import Map
 from vslam.types.map_kernels import (
     erase_landmark,
@@ -30,17 +32,24 @@ _MIN_FOUND_RATIO = 0.25
 # III-D, printed]
 MIN_SHARED = 15
 
+INERTIAL_KEYFRAMES = 10  # newest keyframes that inertial factors connect
 RECENT_KEYFRAMES = 3  # how long a landmark is on probation, in keyframes (ORB-SLAM, VI-B)
 
 
-def map_keyframe(map_: Map, keyframe: int, context: Context) -> None:
-    """Run local mapping for a new keyframe, which must already be linked to its landmarks."""
+def map_keyframe(
+    map_: Map, keyframe: int, context: Context, inertial: InertialWindow | None = None
+) -> None:
+    """Run local mapping for a new keyframe, which must already be linked to its landmarks.
+
+    Args:
+        inertial: what is known from the IMU at the keyframe; None without an IMU.
+    """
     cull_recent_landmarks(map_, keyframe, context.camera)
     triangulate_with_neighbours(map_, keyframe, context)
     refresh_keyframe(map_, keyframe)
     fuse_neighbourhood(map_, keyframe, context)
     refresh_keyframe(map_, keyframe)
-    adjust_locally(map_, keyframe, context)
+    adjust_locally(map_, keyframe, context, inertial)
     cull_keyframes(map_, keyframe, context)
 
 
@@ -72,13 +81,18 @@ def _cull_landmarks(a, first, last, keyframe, min_found_ratio, too_few):
             erase_landmark(a, landmark)
 
 
-def adjust_locally(map_: Map, keyframe: int, context: Context) -> None:
+def adjust_locally(
+    map_: Map, keyframe: int, context: Context, inertial: InertialWindow | None = None
+) -> None:
     """Run local bundle adjustment around a keyframe (section VI-D of the ORB-SLAM paper).
 
     The keyframe, its covisible keyframes and all landmarks that these keyframes observe are
     optimised. Other keyframes that observe these landmarks are held fixed. The first keyframe of
     the map is also held fixed, because it defines the world frame. Afterwards, observations that
     fail the chi-square test are removed.
+
+    Args:
+        inertial: samples that connect the newest keyframes of the window; None without an IMU.
     """
     config = context.config
     free, fixed, landmarks = local_window(map_, keyframe, config)
@@ -87,14 +101,46 @@ def adjust_locally(map_: Map, keyframe: int, context: Context) -> None:
         return
     coarse = adjust(problem, iterations=config.mapping.ba_iterations // 2, tolerance=1e-3)
     refined = replace(problem, T_cw=coarse.T_cw, points=coarse.points)
-    final = adjust(
-        refined, iterations=config.mapping.ba_iterations, use=coarse.inlier, tolerance=1e-3
-    )
+    cameras, iterations = np.concatenate([free, fixed]), config.mapping.ba_iterations
+    chain = None if inertial is None else chain_in(map_, keyframe, cameras, inertial)
+    final = None
+    if chain is not None:
+        final = adjust_with_imu(
+            refined, chain, iterations=iterations, use=coarse.inlier, tolerance=1e-3
+        )
+    if final is None:
+        final = adjust(refined, iterations=iterations, use=coarse.inlier, tolerance=1e-3)
     a = map_.arrays
     a.T_cw[free] = final.T_cw[: len(free)]
     a.xyz[landmarks] = final.points
     remove_observations(a, rows[~final.inlier])
     refresh_landmarks(a, landmarks, map_.scales)
+
+
+def chain_in(
+    map_: Map, keyframe: int, cameras: NDArray[np.int64], inertial: InertialWindow
+) -> InertialChain | None:
+    """Connect the newest keyframes of a local window by inertial factors, up to a keyframe that is
+    not part of the window. None if there are no two such keyframes.
+
+    Args:
+        cameras: ``(K,)`` ids of the keyframes of the window.
+    """
+    a, restarts = map_.arrays, map_.restarts
+    index = np.full(map_.n_keyframes, -1, np.int64)
+    index[cameras] = np.arange(len(cameras))
+    ids: list[int] = []
+    for one in range(keyframe, -1, -1):
+        if not a.keyframe_alive[one]:
+            continue
+        if index[one] < 0 or map_.sessions[one] != map_.sessions[keyframe]:
+            break
+        ids.append(one)
+        if one in restarts or len(ids) == INERTIAL_KEYFRAMES:
+            break
+    ids.reverse()
+    R_world_camera = a.T_cw[keyframe, :3, :3].T
+    return chain_of(inertial, index[ids], map_.timestamps[ids], R_world_camera)
 
 
 def local_window(

@@ -176,6 +176,21 @@ def test_an_imu_is_never_worse_in_the_light():
     assert error(one[-1])[0] < error(other[-1])[0] + 0.002
 
 
+def test_poses_by_images_and_samples_shake_less_than_by_images():
+    """After the start, the errors of the motion from frame to frame are compared."""
+
+    def shaking(results) -> np.ndarray:
+        pairs = [results[k - 1 : k + 1] for k in range(20, LAST)]
+        apart = [
+            se3_log(inverse(TRUTH[b.index]) @ TRUTH[a.index] @ inverse(a.T_wc) @ b.T_wc)
+            for a, b in pairs
+        ]
+        return np.sqrt(np.mean(np.square(apart).reshape(-1, 2, 3).sum(axis=2), axis=0))
+
+    with_imu, alone = shaking(walk(slam_with(), samples())), shaking(walk(slam_with(None), None))
+    assert (with_imu < 0.9 * alone).all()
+
+
 def test_samples_without_a_calibration_change_nothing():
     one, other = slam_with(None), slam_with(None)
     walk(one, samples(), last=20)

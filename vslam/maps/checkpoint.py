@@ -33,6 +33,7 @@ CHECKPOINTS = Codec(
         "Features.u_right": ("N",),
         # Only the pyramid of a new keyframe is needed.
         "Extracted.pyramid": None,
+        "Track.inertial": None,
         "Track.T_cw": (4, 4),
         "Track.landmark": ("N",),
         "Track.xyz": ("N", 3),

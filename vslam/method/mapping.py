@@ -30,6 +30,7 @@ from vslam.support.workers import Workers
 from vslam.types.camera import Image
 from vslam.types.context import Context
 from vslam.types.frame_poses import FrameTable
+from vslam.types.imu import InertialWindow
 from vslam.types.map import Map
 from vslam.types.states import PublishedState
 from vslam.types.track import Track
@@ -89,7 +90,8 @@ class Mapper:
                 search = partial(
                     closing.search, keyframe=keyframe, features=track.features, image=image
                 )
-                published.start(partial(self._map_keyframe, keyframe), search)
+                job = partial(self._map_keyframe, keyframe, track.inertial)
+                published.start(job, search)
             else:
                 closing.process(map_, keyframe, track.features, image)
         return track
@@ -183,6 +185,6 @@ class Mapper:
         landmark[track.landmark >= 0] = new_id[track.tracked]
         return replace(track, landmark=landmark)
 
-    def _map_keyframe(self, keyframe: int, map_: Map) -> None:
-        map_and_calibrate(map_, keyframe, self._context)
+    def _map_keyframe(self, keyframe: int, inertial: InertialWindow | None, map_: Map) -> None:
+        map_and_calibrate(map_, keyframe, self._context, inertial)
         self._closing.apply_adjustment_if_due(map_, keyframe)

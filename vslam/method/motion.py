@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vslam.backend.inertial_filter import camera_pose
+from vslam.backend.inertial_filter import FALL_AND_BIAS, camera_pose
 from vslam.backend.inertial_start import GravityState
 from vslam.frontend.motion_time import RECENT, motion_seconds
 from vslam.frontend.prediction import Prediction
@@ -16,6 +16,7 @@ from vslam.frontend.tracking import uncertainty_of
 from vslam.method.inertia import (
     CARRIED_S,
     KEPT_S,
+    LONGEST_GAP,
     SCALE_STRETCHES,
     SIGMA_PX,
     found_scale,
@@ -43,7 +44,7 @@ from vslam.types.geometry import (
     se3_log,
     transform,
 )
-from vslam.types.imu import ImuCalibration, Inertia
+from vslam.types.imu import ImuCalibration, Inertia, InertialState, InertialWindow
 from vslam.types.map_view import MapView
 from vslam.types.odometry import OdometryState, at_keyframe, moved
 from vslam.types.states import MotionState
@@ -141,6 +142,8 @@ class Motion:
             track, T_moved, predicted, covariance, of_offset, found_again=found_again
         )
         inertia = self._learned(track, predicted, odometry, found_again=found_again)
+        if not found_again and track.by is not By.STANDSTILL:
+            track, odometry = self._fused(track, predicted, odometry, inertia)
         self.state = MotionState(odometry, 0, inertia)
         return self._with_gravity(track)
 
@@ -223,6 +226,19 @@ class Motion:
             stands_still=track.by is By.STANDSTILL,
         )  # fmt: skip
 
+    def _fused(
+        self, track: Track, predicted: Prediction, odometry: OdometryState, inertia: Inertia
+    ) -> tuple[Track, OdometryState]:
+        """Return a tracked frame and the odometry at the pose that images and samples give
+        together, weighed by their covariances."""
+        state = inertia.state
+        if self._imu is None or predicted.inertial is None or state is None or inertia.refused:
+            return track, odometry
+        T_odom_fused = camera_pose(state, self._imu.T_imu_camera)
+        T_fused_seen = self._as_tracked(inverse(T_odom_fused) @ odometry.T_odom_camera)
+        track = replace(track, T_cw=orthonormalised(T_fused_seen @ track.T_cw))
+        return track, replace(odometry, T_odom_camera=T_odom_fused)
+
     def _with_gravity(self, track: Track) -> Track:
         """Return a frame, to which the state of the IMU has moved, with the direction of gravity in
         the camera that is tracked."""
@@ -233,7 +249,24 @@ class Motion:
         if self._context.camera.quarter_turns:
             R = self._context.camera.T_mounted_camera[:3, :3]
             found = replace(found, direction=R.T @ found.direction)
-        return replace(track, gravity=found)
+        return replace(track, gravity=found, inertial=self._window(state, self._imu))
+
+    def _window(self, state: InertialState, imu: ImuCalibration) -> InertialWindow:
+        """Return what local bundle adjustment needs to know from the IMU at this frame."""
+        camera, turn = self._context.camera, np.eye(9)
+        R_camera_odom = self.state.odometry.T_odom_camera[:3, :3].T
+        if camera.quarter_turns:
+            R_camera_odom = camera.T_mounted_camera[:3, :3].T @ R_camera_odom
+        turn[:3, :3] = R_camera_odom
+        return InertialWindow(
+            self.state.inertia.samples,
+            R_camera_odom @ state.gravity,
+            state.bias,
+            turn @ state.covariance[FALL_AND_BIAS, FALL_AND_BIAS] @ turn.T,
+            imu.T_imu_camera @ camera.T_mounted_camera,
+            imu.noise,
+            LONGEST_GAP,
+        )
 
     def _as_tracked(self, T_now_last: Matrix) -> Matrix:
         """Return a motion of the camera as it is mounted as a motion of the camera that is tracked,

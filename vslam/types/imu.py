@@ -253,3 +253,26 @@ class Inertia:
     known_since: float = -1.0
     scale_sigma: float = -1.0
     metric_since: float = -1.0
+
+
+@dataclass(frozen=True, eq=False)
+class InertialWindow:
+    """What local bundle adjustment needs to know from the IMU at a frame.
+
+    Attributes:
+        samples: ``(N, 7)`` samples up to the frame, see the top of this module.
+        gravity: ``(3,)`` acceleration of free fall in the frame of the camera, m/s^2.
+        bias: ``(6,)`` biases of gyroscope and accelerometer.
+        covariance: ``(9, 9)`` of gravity and the biases.
+        T_imu_camera: ``(4, 4)``, maps points of the tracked camera to the IMU.
+        noise: of the IMU at rest.
+        longest_gap: seconds between two samples above which they do not tell the motion.
+    """
+
+    samples: Matrix
+    gravity: Matrix
+    bias: Matrix
+    covariance: Matrix
+    T_imu_camera: Matrix
+    noise: ImuNoise
+    longest_gap: float

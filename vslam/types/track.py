@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from vslam.types.features import Extracted, Features, Pyramid, TrackingState
 from vslam.types.geometry import Matrix
-from vslam.types.imu import GravityDirection
+from vslam.types.imu import GravityDirection, InertialWindow
 
 
 class By(StrEnum):
@@ -100,6 +100,8 @@ class Track:
         coarse: the small images of the frame (``coarse_levels``), to which the next frame is
             aligned; None if frames are not aligned.
         is_keyframe: whether the frame became a keyframe.
+        inertial: what local bundle adjustment needs to know from the IMU; None if gravity is not
+            known.
         gravity: direction of free fall in the frame of the camera; None if it is unknown.
     """
 
@@ -122,6 +124,7 @@ class Track:
     still: Standstill | None = None
     coarse: Pyramid | None = None
     is_keyframe: bool = False
+    inertial: InertialWindow | None = None
     gravity: GravityDirection | None = None
 
     @property

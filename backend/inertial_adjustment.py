@@ -1,0 +1,253 @@
+"""Local bundle adjustment with the samples of an IMU.
+
+The newest keyframes, in the order of time, get a velocity and biases. Inertial factors
+(``backend/inertial_factor.py``) connect consecutive keyframes, and gravity is a further unknown.
+Landmarks are eliminated as without an IMU. Then, the factors are added to the dense reduced system
+of the cameras. The velocities, biases and gravity exist only during one adjustment: the poses give
+good start values, and a prior brings what the filter has learned of gravity and the biases.
+
+A window in which samples and images do not agree is adjusted without the samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.backend.bundle_adjustment import (
+    BundleProblem,
+    BundleSolution,
+    cholesky_solve,
+    empty_equations,
+    linearise,
+    observations_of,
+    reduced_system,
+    robust_cost,
+    step_cameras,
+    step_points,
+)
+from vslam.backend.inertial_factor import inertial_factor, information
+from vslam.backend.inertial_filter import inflated
+from vslam.backend.preintegration import Preintegration, preintegrate
+from vslam.types.geometry import Matrix
+from vslam.types.imu import InertialWindow
+
+N_STATE = 9  # velocity and biases of a keyframe
+# The mean chi-square of the residuals of rotation, velocity and position per factor, of which each
+# has nine, above which samples and images do not agree. [own]
+MAX_MISFIT = 27.0
+LONGEST_S = 1.5  # s between two keyframes that a factor connects
+
+
+@dataclass(frozen=True, eq=False)
+class InertialChain:
+    """Keyframes that inertial factors connect, in the order of time.
+
+    Attributes:
+        camera: ``(M,)`` int64, indices of the keyframes in the bundle problem.
+        motions: the M - 1 motions between consecutive keyframes.
+        weights: ``(15, 15)`` inverse covariance of each factor.
+        T_imu_camera: ``(4, 4)``, maps points of the camera to the IMU.
+        gravity: ``(3,)`` expected acceleration of free fall in the world, m/s^2.
+        bias: ``(6,)`` expected biases.
+        information: ``(9, 9)`` inverse covariance of the expected gravity and biases.
+    """
+
+    camera: NDArray[np.int64]
+    motions: Sequence[Preintegration]
+    weights: Sequence[Matrix]
+    T_imu_camera: Matrix
+    gravity: Matrix
+    bias: Matrix
+    information: Matrix
+
+    @property
+    def n_unknowns(self) -> int:
+        """Number of unknowns besides the poses: gravity, and the state of each keyframe."""
+        return 3 + N_STATE * len(self.camera)
+
+
+def chain_of(
+    window: InertialWindow,
+    camera: NDArray[np.int64],
+    times: NDArray[np.float64],
+    R_world_camera: Matrix,
+) -> InertialChain | None:
+    """Connect keyframes by inertial factors. None if no two keyframes can be connected.
+
+    The chain begins after the last gap between two keyframes, or of the samples.
+
+    Args:
+        camera: ``(M,)`` indices of keyframes in the bundle problem, in the order of time.
+        times: ``(M,)`` seconds.
+        R_world_camera: ``(3, 3)`` rotation of the last of these keyframes.
+    """
+    noise, motions = inflated(window.noise), []
+    since = window.samples[0, 0] if len(window.samples) else np.inf
+    for k in range(len(times) - 1, 0, -1):
+        start, end = float(times[k - 1]), float(times[k])
+        if start < since or end - start > LONGEST_S:
+            break
+        motion = preintegrate(window.samples, start, end, noise, window.bias)
+        if motion.longest_gap > window.longest_gap:
+            break
+        motions.append(motion)
+    if not motions:
+        return None
+    motions.reverse()
+    weights = [information(motion, noise) for motion in motions]
+    to_world = np.eye(9)
+    to_world[:3, :3] = R_world_camera
+    expected = np.linalg.inv(to_world @ window.covariance @ to_world.T)
+    return InertialChain(
+        camera[-len(motions) - 1 :],
+        motions,
+        weights,
+        window.T_imu_camera,
+        R_world_camera @ window.gravity,
+        window.bias,
+        0.5 * (expected + expected.T),
+    )
+
+
+def adjust_with_imu(
+    problem: BundleProblem,
+    chain: InertialChain,
+    *,
+    iterations: int,
+    use: NDArray[np.bool_] | None = None,
+    tolerance: float = 1e-6,
+) -> BundleSolution | None:
+    """Minimise the reprojection errors and the residuals of the inertial factors together, by
+    Levenberg-Marquardt.
+
+    Args:
+        use, tolerance: see ``adjust``.
+
+    Returns:
+        The solution, whose cost contains that of the factors. None if samples and images do not
+        agree.
+    """
+    n_free, n_poses = problem.n_free, 6 * problem.n_free
+    observations = observations_of(problem, use)
+    equations = empty_equations(n_free, len(problem.points), len(problem.camera))
+    size = n_poses + chain.n_unknowns
+    S, rhs, V_inverse = (
+        np.empty((size, size)),
+        np.empty(size),
+        np.empty((len(problem.points), 3, 3)),
+    )
+    inlier = np.ones(len(problem.camera), np.bool_)
+    T_cw, points, inertial = problem.T_cw, problem.points, start_values(problem.T_cw, chain)
+    factors = linear_factors(T_cw, inertial, chain, n_free)
+    cost = robust_cost(T_cw, points, observations, inlier) + factors.cost
+    damping, growth, done = 1e-5, 2.0, 0
+    while done < iterations:
+        done += 1
+        linearise(T_cw, n_free, points, observations, equations)
+        before = cost
+        for _ in range(8):
+            reduced_system(n_free, observations, equations, damping, S, rhs, V_inverse)
+            S += factors.hessian
+            S[np.diag_indices(size)] += damping * np.diag(factors.hessian)
+            rhs[n_poses:] = 0.0
+            rhs += factors.gradient
+            if cholesky_solve(S, rhs):
+                T_trial, points_trial = T_cw.copy(), points.copy()
+                step_points(n_free, observations, equations, rhs, V_inverse, points, points_trial)
+                step_cameras(n_free, rhs, T_cw, T_trial)
+                trial = linear_factors(T_trial, inertial + rhs[n_poses:], chain, n_free)
+                total = robust_cost(T_trial, points_trial, observations, inlier) + trial.cost
+                if total < cost:
+                    T_cw, points, cost, factors = T_trial, points_trial, total, trial
+                    inertial = inertial + rhs[n_poses:]
+                    damping, growth = max(damping * 0.1, 1e-9), 2.0
+                    break
+            damping *= growth * 5.0
+            growth *= 2.0
+        if not cost < before * (1.0 - tolerance):
+            break
+    if not factors.misfit <= MAX_MISFIT:
+        return None
+    robust_cost(T_cw, points, observations, inlier)
+    return BundleSolution(T_cw, points, cost, inlier, done)
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFactors:
+    """The inertial factors and the prior, linearised.
+
+    Attributes:
+        hessian, gradient: ``(S, S)`` and ``(S,)`` of the unknowns: the increments of the free
+            cameras, of gravity, and of the states of the keyframes.
+        cost: half the sum of the squared residuals.
+        misfit: mean chi-square of the residuals of rotation, velocity and position.
+    """
+
+    hessian: Matrix
+    gradient: Matrix
+    cost: float
+    misfit: float
+
+
+def start_values(T_cw: Matrix, chain: InertialChain) -> Matrix:
+    """Return ``(U,)`` gravity and the states of the keyframes, for given ``(K, 4, 4)`` poses."""
+    g, T_ic = chain.gravity, chain.T_imu_camera
+    states = np.tile(np.r_[np.zeros(3), chain.bias], (len(chain.camera), 1))
+    poses = [np.linalg.inv(T_ic @ T_cw[k]) for k in chain.camera]
+    for k, motion in enumerate(chain.motions):
+        t, R = motion.seconds, poses[k][:3, :3]
+        moved = poses[k + 1][:3, 3] - poses[k][:3, 3] - R @ motion.position
+        states[k, :3] = moved / t - 0.5 * t * g
+        states[k + 1, :3] = states[k, :3] + t * g + R @ motion.velocity
+    return np.concatenate([g, states.ravel()])
+
+
+def linear_factors(
+    T_cw: Matrix, inertial: Matrix, chain: InertialChain, n_free: int
+) -> LinearFactors:
+    """Linearise the factors of a chain.
+
+    Args:
+        T_cw: ``(K, 4, 4)`` poses, of which the first ``n_free`` are optimised.
+        inertial: ``(U,)`` gravity and the states of the keyframes.
+    """
+    n_poses = 6 * n_free
+    size = n_poses + len(inertial)
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    gravity, states = inertial[:3], inertial[3:].reshape(-1, N_STATE)
+    cost = misfit = 0.0
+    of_gravity = n_poses + np.arange(3)
+    for k, (motion, weight) in enumerate(zip(chain.motions, chain.weights, strict=True)):
+        ends = chain.camera[k : k + 2]
+        r, J = inertial_factor(
+            motion,
+            T_cw[ends[0]],
+            T_cw[ends[1]],
+            states[k],
+            states[k + 1],
+            gravity,
+            chain.T_imu_camera,
+        )
+        weighted = weight @ r
+        cost += 0.5 * float(r @ weighted)
+        misfit += float(r[:9] @ weighted[:9])
+        first = n_poses + 3 + N_STATE * k
+        at = np.concatenate(
+            [*(6 * ends[:, None] + np.arange(6)), first + np.arange(2 * N_STATE), of_gravity]
+        )
+        used = np.concatenate([np.repeat(ends < n_free, 6), np.ones(2 * N_STATE + 3, np.bool_)])
+        J, at = J[:, used], at[used]
+        hessian[np.ix_(at, at)] += J.T @ weight @ J
+        gradient[at] -= J.T @ weighted
+    # The prior of gravity and of the biases of the first keyframe
+    at = np.concatenate([of_gravity, n_poses + 3 + 3 + np.arange(6)])
+    r = np.concatenate([gravity - chain.gravity, states[0, 3:] - chain.bias])
+    weighted = chain.information @ r
+    hessian[np.ix_(at, at)] += chain.information
+    gradient[at] -= weighted
+    cost += 0.5 * float(r @ weighted)
+    return LinearFactors(hessian, gradient, cost, misfit / max(len(chain.motions), 1))

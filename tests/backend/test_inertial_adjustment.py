@@ -1,0 +1,227 @@
+"""The inertial factor against differences and GTSAM, and bundle adjustment with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from tests.inertial import ADIS16448, DOWN, Flight
+from vslam.backend.bundle_adjustment import BundleProblem, adjust
+from vslam.backend.inertial_adjustment import (
+    InertialChain,
+    adjust_with_imu,
+    chain_of,
+    linear_factors,
+    start_values,
+)
+from vslam.backend.inertial_factor import inertial_factor, information
+from vslam.backend.preintegration import preintegrate, so3_exp, so3_log
+from vslam.types.camera import Camera
+from vslam.types.geometry import inverse, se3_exp, transform
+from vslam.types.imu import InertialWindow
+
+CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480)
+T_IC = np.eye(4)
+T_IC[:3, :3] = so3_exp(np.array([0.3, -1.2, 0.7]))
+T_IC[:3, 3] = 0.1, -0.05, 0.2
+BIAS = np.array([0.01, -0.02, 0.015, 0.1, -0.05, 0.08])
+FLIGHT = Flight(seed=3)
+PRIOR = np.diag(np.square([*[0.05] * 3, *[0.01] * 3, *[0.1] * 3]))
+
+
+def camera_at(t: float, flight: Flight = FLIGHT) -> np.ndarray:
+    """Return ``T_cw`` of the camera of the flight."""
+    return inverse(flight.pose(t) @ T_IC)
+
+
+def samples(noise=None, seed: int = 0, rate: float = 200.0, flight: Flight = FLIGHT) -> np.ndarray:
+    return flight.samples(np.arange(-0.1, 4.0, 1.0 / rate), BIAS, noise, seed)
+
+
+def window(rows: np.ndarray, **changes) -> InertialWindow:
+    found = InertialWindow(rows, DOWN, BIAS, PRIOR, T_IC, ADIS16448, 0.1)
+    return replace(found, **changes)
+
+
+def factor(x: np.ndarray, motion) -> tuple[np.ndarray, np.ndarray]:
+    """Evaluate a factor at increments ``x`` of poses, states and gravity."""
+    states = [np.r_[FLIGHT.velocity(t), BIAS + 0.01] for t in (1.0, 1.4)]
+    return inertial_factor(
+        motion,
+        se3_exp(x[:6]) @ se3_exp(np.full(6, 0.02)) @ camera_at(1.0),
+        se3_exp(x[6:12]) @ camera_at(1.4),
+        states[0] + x[12:21],
+        states[1] + x[21:30],
+        DOWN + x[30:],
+        T_IC,
+    )
+
+
+def test_the_residuals_are_zero_at_the_truth():
+    motion = preintegrate(samples(rate=2000.0), 1.0, 1.4, ADIS16448, BIAS)
+    states = [np.r_[FLIGHT.velocity(t), BIAS] for t in (1.0, 1.4)]
+    r, _ = inertial_factor(motion, camera_at(1.0), camera_at(1.4), *states, DOWN, T_IC)
+    np.testing.assert_allclose(r, 0.0, atol=1e-6)
+
+
+def test_the_derivatives_are_those_of_differences():
+    motion = preintegrate(samples(), 1.0, 1.4, ADIS16448, BIAS)
+    _, J = factor(np.zeros(33), motion)
+    step = 1e-6 * np.eye(33)
+    differences = [(factor(e, motion)[0] - factor(-e, motion)[0]) / 2e-6 for e in step]
+    np.testing.assert_allclose(J, np.transpose(differences), atol=1e-6)
+
+
+def test_the_cost_is_gtsams():
+    """GTSAM holds each sample until the next one, so that many samples are needed to compare."""
+    rows = samples(rate=20_000.0)
+    inside = rows[(rows[:, 0] >= 1.0 - 1e-9) & (rows[:, 0] < 1.4 - 1e-9)]
+    params = gtsam.PreintegrationParams(DOWN)
+    params.setGyroscopeCovariance(np.eye(3) * ADIS16448.gyro**2)
+    params.setAccelerometerCovariance(np.eye(3) * ADIS16448.accel**2)
+    params.setIntegrationCovariance(1e-16 * np.eye(3))
+    bias = gtsam.imuBias.ConstantBias(BIAS[3:], BIAS[:3])
+    theirs = gtsam.PreintegratedImuMeasurements(params, bias)
+    for row in inside:
+        theirs.integrateMeasurement(row[4:], row[1:4], 1.0 / 20_000.0)
+    values = gtsam.Values()
+    T = [se3_exp(np.full(6, 0.002)) @ camera_at(1.0), camera_at(1.4)]
+    v = [FLIGHT.velocity(1.0) + 0.01, FLIGHT.velocity(1.4)]
+    for k in range(2):
+        values.insert(k, gtsam.Pose3(inverse(T[k]) @ inverse(T_IC)))
+        values.insert(2 + k, v[k])
+    values.insert(4, bias)
+    expected = gtsam.ImuFactor(0, 2, 1, 3, 4, theirs).error(values)
+    motion = preintegrate(rows, 1.0, 1.4, ADIS16448, BIAS)
+    r, _ = inertial_factor(motion, *T, np.r_[v[0], BIAS], np.r_[v[1], BIAS], DOWN, T_IC)
+    ours = 0.5 * r @ information(motion, ADIS16448) @ r
+    assert ours == pytest.approx(expected, rel=2e-3)
+    assert expected > 100.0
+
+
+def scene(
+    seed: int, n: int = 8, step: float = 0.3, sigma: float = 1.0, flight: Flight = FLIGHT
+) -> tuple[BundleProblem, np.ndarray, np.ndarray]:
+    """Make a bundle problem of a few points far away. The first keyframe is held fixed.
+
+    Returns:
+        The problem, the true poses, and the times of the keyframes, both in the order of time. The
+        fixed keyframe is the last camera of the problem.
+    """
+    rng = np.random.default_rng(seed)
+    times = 0.5 + step * np.arange(n)
+    truth = np.array([camera_at(t, flight) for t in times])
+    order = np.r_[1:n, 0]
+    points, uvr, camera, first = [], [], [], [0]
+    while len(points) < 60:
+        k = rng.integers(n)
+        near = np.array([rng.uniform(-4, 4), rng.uniform(-3, 3), rng.uniform(4, 12)])
+        point = transform(inverse(truth[k]), near[None])[0]
+        seen = []
+        for place, one in enumerate(order):
+            q = transform(truth[one], point[None])[0]
+            if q[2] < 1.0:
+                continue
+            u = CAMERA.project(q[None])[0]
+            if 0 < u[0] < 640 and 0 < u[1] < 480:
+                seen.append((place, u + sigma * rng.standard_normal(3)))
+        if len(seen) < 2:
+            continue
+        points.append(point + 0.02 * rng.standard_normal(3))
+        camera += [place for place, _ in seen]
+        uvr += [u for _, u in seen]
+        first.append(len(camera))
+    poses = [se3_exp(0.01 * rng.standard_normal(6)) @ T for T in truth[order]]
+    poses[-1] = truth[0]
+    problem = BundleProblem(
+        np.array(poses),
+        n - 1,
+        np.array(points),
+        np.array(first),
+        np.array(camera),
+        np.array(uvr),
+        np.full(len(camera), sigma**-2.0),
+        CAMERA.intrinsics,
+    )
+    return problem, truth[order], times
+
+
+def chain(problem: BundleProblem, times: np.ndarray, found: InertialWindow) -> InertialChain:
+    n = problem.n_free
+    made = chain_of(found, np.r_[n, 0:n], times, np.eye(3))
+    assert made is not None
+    return made
+
+
+def errors(T_cw: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return the RMS errors of position (m) and rotation (rad)."""
+    moved = [inverse(a) @ b for a, b in zip(T_cw, truth, strict=True)]
+    turns = [so3_log(T[:3, :3]) for T in moved]
+    return np.array(
+        [np.sqrt(np.mean(np.square(x)) * 3) for x in ([T[:3, 3] for T in moved], turns)]
+    )
+
+
+@pytest.mark.parametrize("n_free", [0, 4, 7])
+def test_the_gradient_of_the_factors_is_that_of_their_cost(n_free):
+    problem, _, times = scene(0)
+    made = chain(problem, times, window(samples(ADIS16448)))
+    inertial = start_values(problem.T_cw, made)
+    rng = np.random.default_rng(1)
+    inertial = inertial + 0.01 * rng.standard_normal(len(inertial))
+    found = linear_factors(problem.T_cw, inertial, made, n_free)
+
+    def cost(x: np.ndarray) -> float:
+        T_cw = problem.T_cw.copy()
+        for k in range(n_free):
+            T_cw[k] = se3_exp(x[6 * k : 6 * k + 6]) @ T_cw[k]
+        return linear_factors(T_cw, inertial + x[6 * n_free :], made, n_free).cost
+
+    step = 1e-6 * np.eye(len(found.gradient))
+    differences = [-(cost(e) - cost(-e)) / 2e-6 for e in step]
+    np.testing.assert_allclose(
+        found.gradient, differences, rtol=1e-4, atol=1e-6 * np.abs(differences).max()
+    )
+
+
+def test_poses_are_better_with_samples():
+    """Five random scenes. The observations are as uncertain as in fast motion."""
+    alone, together = [], []
+    for seed in range(5):
+        problem, truth, times = scene(seed)
+        found = window(samples(ADIS16448, seed), bias=BIAS + 0.002)
+        solution = adjust_with_imu(problem, chain(problem, times, found), iterations=20)
+        assert solution is not None
+        alone.append(errors(adjust(problem, iterations=20).T_cw, truth))
+        together.append(errors(solution.T_cw, truth))
+    assert (np.array(together) < np.array(alone)).all()
+    assert (np.mean(together, axis=0) < 0.8 * np.mean(alone, axis=0)).all()
+
+
+def test_samples_that_contradict_the_images_are_not_used():
+    problem, _, times = scene(0)
+    rows = samples(ADIS16448)
+    for wrong in (
+        window(np.c_[rows[:, :1], np.degrees(rows[:, 1:4]), rows[:, 4:]]),
+        window(rows, T_imu_camera=inverse(T_IC)),
+        window(rows, gravity=-DOWN),
+    ):
+        assert adjust_with_imu(problem, chain(problem, times, wrong), iterations=20) is None
+
+
+def test_a_chain_begins_after_the_last_gap():
+    rows, times = samples(), 0.5 + 0.3 * np.arange(8)
+    camera = np.arange(8)
+    assert chain_of(window(rows), camera, times, np.eye(3)).camera.tolist() == camera.tolist()
+    gap = (rows[:, 0] > 1.2) & (rows[:, 0] < 1.35)
+    assert chain_of(window(rows[~gap]), camera, times, np.eye(3)).camera.tolist() == [3, 4, 5, 6, 7]
+    late = times + np.where(np.arange(8) > 5, 1.3, 0.0)
+    assert chain_of(window(rows), camera, late, np.eye(3)).camera.tolist() == [6, 7]
+    assert chain_of(window(rows[rows[:, 0] > 1.0]), camera, times, np.eye(3)).camera.tolist() == [
+        2,
+        *range(3, 8),
+    ]
+    assert chain_of(window(rows[:0]), camera, times, np.eye(3)) is None

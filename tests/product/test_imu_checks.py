@@ -134,6 +134,16 @@ def test_an_alignment_is_as_accurate_as_it_says():
     assert ms < 0.5
 
 
+@pytest.mark.parametrize("end", [0, 1])
+def test_samples_may_begin_and_end_with_the_frames(end):
+    drive = Drive(1)
+    since = drive.samples[:, 0] - drive.times[-end]
+    samples = drive.samples[since <= 0.0 if end else since >= 0.0]
+    found = align(drive.times, drive.rotations, samples)
+    assert found is not None
+    assert found.time_offset == pytest.approx(0.0, abs=1e-3)
+
+
 def test_nothing_is_said_about_a_camera_that_does_not_turn():
     drive = Drive(0)
     still = np.repeat(np.eye(3)[None], len(drive.times), axis=0)

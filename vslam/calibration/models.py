@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.types.camera import Camera
 from vslam.types.imu import ImuCalibration, ImuNoise
 
 Array = NDArray[np.float64]
@@ -80,6 +81,18 @@ class Calibration:
     imu: ImuCalibration | None = field(default=None, compare=False)
     imu_noise: ImuNoise | None = None
     source: str = field(default="the calibration", compare=False)
+
+    @classmethod
+    def of_rectified(cls, camera: Camera) -> Calibration:
+        """Return the calibration of images that are rectified already."""
+        one = CameraModel(
+            camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, "pinhole"
+        )
+        if camera.sensor != "stereo":
+            return cls(one, virtual_baseline=camera.baseline if camera.depth else None)
+        T_left_right = np.eye(4)
+        T_left_right[0, 3] = camera.baseline
+        return cls(one, one, T_left_right, right_delay=camera.right_delay)
 
     def left_alone(self) -> Calibration:
         return replace(self, right=None, T_left_right=None, right_delay=0.0)

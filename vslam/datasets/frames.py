@@ -164,8 +164,8 @@ class Source(_Frames):
         warnings: what the report of a run must say about the data, in sentences.
         imu: the IMU on the camera; None if there is none. Its calibration refers to the left camera
             of ``camera``.
-        calibration: calibration of the images before rectification; None if the reader takes no
-            calibration file.
+        calibration: calibration of the images before rectification; None if the reader finds them
+            rectified.
         rectify_mask: function that rectifies an ``(H, W)`` uint8 mask of the original left images.
             None if vslam does not rectify the images.
         world: name of the world frame of the ground truth, which all drives along a rendered route

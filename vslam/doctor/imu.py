@@ -65,11 +65,9 @@ def measure_alignment(
     if imu is None or len(imu.recorded.samples) < 2:
         return None
     samples = imu.recorded.samples
-    times = source.timestamps
     offset = 0.0 if imu.calibration is None else imu.calibration.time_offset
-    chosen = _liveliest(times + offset, samples, longest_s, most_frames)
-    rotations = _track(source, chosen, config)
-    return align(times[chosen], rotations, samples)
+    chosen = _liveliest(source.timestamps + offset, samples, longest_s, most_frames)
+    return align(source.timestamps[chosen], track_rotations(source, chosen, config), samples)
 
 
 def _liveliest(
@@ -87,7 +85,7 @@ def _liveliest(
     return slice(begin, begin + n)
 
 
-def _track(source: Source, chosen: slice, config: Config) -> Matrix:
+def track_rotations(source: Source, chosen: slice, config: Config) -> Matrix:
     """Return ``(M, 3, 3)`` ``R_wc`` of the chosen frames, NaN where the camera is lost."""
     frames = source.stored[chosen]
     rotations = np.full((len(frames), 3, 3), np.nan)

@@ -50,13 +50,11 @@ def measure_imu(source: Source, config: Config) -> MeasuredImu:
     Raises:
         InputError: there is no IMU, its samples are unusable, or the camera turns too little.
     """
-    imu, calibration = source.imu, source.calibration
+    imu, calibration = source.imu, source.calibration or Calibration.of_rectified(source.camera)
     if imu is None:
         raise InputError(
             f"{source.name}: there is no IMU; put its samples into imu.csv (docs/howto/imu.md)."
         )
-    if calibration is None:
-        raise InputError(f"{source.name}: its reader takes no calibration; give images or a bag.")
     for check in check_samples(imu.recorded.samples):
         if check.wrong and check.harmful:
             raise InputError(f"{imu.name}: {check.name}: {check.measured}; {check.fix}.")

@@ -110,12 +110,16 @@ def align(times: Array, rotations: Matrix, samples: Matrix) -> Alignment | None:
     if not np.isfinite(costs[best]):
         return None
     offset = _minimum(lambda at: fit(at).cost, float(offsets[best]), _STEP_S)
+    # How the rates at the frames change with the offset, for its standard deviation.
+    h = 0.5 * _STEP_S
+    kept = (begins + offset - h >= samples[0, 0]) & (ends + offset + h <= samples[-1, 0])
+    if kept.sum() < _FEWEST:
+        return None
+    fit = partial(_fit, begins[kept], ends[kept], camera[kept], samples[:, 0], integral)
     found = fit(offset)
     rate = float(np.sqrt(np.mean(np.sum(found.camera**2, axis=1))))
     if rate < _LEAST_RATE:
         return None
-    # How the rates at the frames change with the offset, for its standard deviation.
-    h = 0.5 * _STEP_S
     slope = (fit(offset + h).gyro - fit(offset - h).gyro) / (2.0 * h)
     size = float(np.median(np.linalg.norm(found.residual, axis=1)))
     variance = (size / _MEDIAN_OF_CHI) ** 2 + 1e-12

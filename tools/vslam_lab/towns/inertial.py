@@ -6,6 +6,7 @@ and the images belong to one motion.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from vslam.calibration.files import CALIBRATION, write_calibration
-from vslam.calibration.models import Calibration, CameraModel
+from vslam.calibration.models import Calibration
 from vslam.datasets.imu import Imu
 from vslam.datasets.imu_csv import HEADER, IMU_FILE
-from vslam.types.camera import Camera
 from vslam.types.imu import GRAVITY, ImuCalibration, ImuNoise
 from vslam_lab.towns.files import write, writing
 from vslam_lab.towns.routes import Route
@@ -102,13 +102,6 @@ def write_imu(route: Route, seed: int, folder: Path) -> None:
     lines = [",".join([f"{row[0]:.6f}", *(f"{x:.9f}" for x in row[1:])]) + "\n" for row in rows]
     with writing(folder):
         write(folder / IMU_FILE, f"{HEADER}\n{''.join(lines)}".encode())
-        write_calibration(folder / CALIBRATION, _calibration(route.camera, imu_on_camera()))
-
-
-def _calibration(camera: Camera, imu: ImuCalibration) -> Calibration:
-    one = CameraModel(
-        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, "pinhole", ()
-    )
-    T_left_right = np.eye(4)
-    T_left_right[0, 3] = camera.baseline
-    return Calibration(one, one, T_left_right, imu=imu, imu_noise=imu.noise)
+        imu = imu_on_camera()
+        calibration = Calibration.of_rectified(route.camera)
+        write_calibration(folder / CALIBRATION, replace(calibration, imu=imu, imu_noise=imu.noise))

@@ -18,7 +18,9 @@ PAGE = Path(__file__).parents[2] / "docs/howto/python.md"
 SECTION = re.compile(r"^## (.*?)\n(.*?)(?=^## |\Z)", re.DOTALL | re.MULTILINE)
 CODE = re.compile(r"```python\n(.*?)```", re.DOTALL)
 RECIPES = {
-    title: "\n".join(CODE.findall(text)) for title, text in SECTION.findall(PAGE.read_text())
+    title: "\n".join(CODE.findall(text))
+    for title, text in SECTION.findall(PAGE.read_text())
+    if "```python" in text
 }
 
 
@@ -45,7 +47,7 @@ def after(corridor: StereoSequence, tmp_path_factory: pytest.TempPathFactory) ->
     return held
 
 
-@pytest.mark.parametrize("title", sorted(set(RECIPES) - {"Change thresholds", "Guarantees"}))
+@pytest.mark.parametrize("title", [title for title in RECIPES if title != "Change thresholds"])
 def test_recipes_build_maps_and_report_no_problem(after, title):
     slam = after[title]["slam"]
     assert slam.map.n_keyframes >= 2
@@ -72,8 +74,3 @@ def test_a_loop_is_told_once(after, capsys):
     said = capsys.readouterr().out
     assert said.count("keyframes 0 and 4: closed, 60 inliers") == 1
     assert said.count("the trajectory has changed: (10, 4, 4)") == 1
-
-
-def test_an_own_detector_is_asked(after):
-    slam = after["Write a loop detector of your own"]["slam"]
-    assert len(slam.detector.seen) == slam.map.n_keyframes

@@ -136,6 +136,22 @@ def test_what_contradicts_is_replaced_and_both_are_shown(call, drive):
     assert "old: time_offset +0.00 ms\n" in out
 
 
+def test_the_doctor_finds_faults_of_the_imu_of_one_camera(call, drive):
+    T = np.eye(4)
+    T[:3, :3] = R_IMU_CAMERA.T
+    rig("mono", imu={"T_imu_camera": T.tolist(), "time_offset": LATE})
+    mono = ["doctor", drive / "left", "--sensor", "mono", "--calib", "rig.yaml"]
+    code, out, _ = call(*mono)
+    assert code == 1
+    (fault,) = (line for line in out.splitlines() if line.startswith("fault") and "IMU" in line)
+    assert fault.split()[1:3] == ["IMU", "rotation"]
+    assert "use its inverse" in out
+    rig("mono", imu={"T_imu_camera": T.T.tolist(), "time_offset": LATE})
+    lines = call(*mono)[1].splitlines()
+    assert [line for line in lines if line.startswith("fault") and "IMU" in line] == []
+    assert any(line.split()[:3] == ["good", "IMU", "rotation"] for line in lines)
+
+
 def refused(call, *words: object) -> str:
     code, _, err = call(*words)
     assert code == 2

@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.backend.inertial_start import GYRO_BIAS
 from vslam.run.imu_alignment import WIDEST_S, Alignment
 from vslam.types.geometry import Matrix
 from vslam.types.imu import GRAVITY, ImuNoise
@@ -39,7 +40,7 @@ _LEAST_OFFSET_S, _LEAST_TURN = 0.004, np.radians(3.0)  # smaller errors are not 
 _SIGMAS = 5.0
 _UNEXPLAINED = 0.5  # share of the gyroscope's rates that no rotation of the camera explains
 _SCALE = 0.1  # relative
-_LARGEST_BIAS = 0.1  # rad/s
+_LARGEST_BIAS = 3.0 * GYRO_BIAS  # rad/s; the inertial start expects smaller ones
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,14 @@ inside the functions that need it, because the import is slow.
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.backend.inertial_filter import DRIFT
 from vslam.config import PoseGraphConfig
 from vslam.support.kernels import kernel
 from vslam.types.geometry import compose, inverse, inverses, se3_log
@@ -70,6 +71,10 @@ class PoseGraph:
             the unit of length around keyframe i. ``T_i_j`` is in the unit around i. The factor
             differs from 1 only for loops of monocular maps, whose scale drifts
             (``similarity_graph``).
+        gravity: ``(N, 3)`` direction of free fall in the frame of each keyframe, as unit vectors;
+            zero where it is unknown.
+        gravity_sigma: ``(N,)`` standard deviation of ``gravity`` along each of the two axes across
+            it, in radians; zero where it is unknown. Both arrays are empty if gravity is not used.
     """
 
     keyframes: NDArray[np.int64]
@@ -80,6 +85,8 @@ class PoseGraph:
     sigmas: NDArray[np.float64]
     fixed: NDArray[np.bool_]
     scale: NDArray[np.float64]
+    gravity: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
+    gravity_sigma: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True)
@@ -173,6 +180,29 @@ def essential_graph(
         fixed=parts_of(edges, len(living)) == np.arange(len(living)),
         scale=scales,
     )
+
+
+def with_gravity(graph: PoseGraph, map_: Map) -> PoseGraph:
+    """Return a pose graph with what an IMU measured of gravity at the keyframes.
+
+    The errors of keyframes that follow each other soon are nearly equal, because the filter forgets
+    slowly: after the time in which the odometry tilts by one standard deviation. The variance of a
+    keyframe is multiplied by the number of keyframes within this time. [own]
+    """
+    direction, sigma = (
+        column[graph.keyframes] for column in (map_.keyframes.gravity, map_.keyframes.gravity_sigma)
+    )
+    known = np.flatnonzero(sigma > 0.0)
+    drive, seconds = map_.sessions[graph.keyframes[known]], map_.timestamps[graph.keyframes[known]]
+    reach = 0.5 * (sigma[known] / DRIFT) ** 2
+    alike = np.empty(len(known))
+    for one in np.unique(drive):
+        of_drive = drive == one
+        times, around = np.sort(seconds[of_drive]), reach[of_drive]
+        end = np.searchsorted(times, seconds[of_drive] + around, "right")
+        alike[of_drive] = end - np.searchsorted(times, seconds[of_drive] - around)
+    sigma[known] *= np.sqrt(alike)
+    return replace(graph, gravity=direction, gravity_sigma=sigma)
 
 
 def connectivity(map_: Map) -> NDArray[np.int64]:
@@ -281,6 +311,47 @@ def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     return T_cw
 
 
+def optimise_level(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
+    """Find the ``(N, 4, 4)`` poses ``T_cw`` that agree best with the edges, and in which gravity
+    has the same direction everywhere.
+
+    This direction in the world frame is found together with the poses. In the optimisation, the
+    world frame is the one in which gravity keeps its direction, and the fixed keyframe may turn.
+    The result is turned back, so that the fixed keyframe stays as it was.
+
+    Args:
+        graph: a connected graph, in which gravity is known at one keyframe or more.
+    """
+    import gtsam
+
+    known = np.flatnonzero(graph.gravity_sigma > 0.0)
+    fixed = int(np.flatnonzero(graph.fixed)[0])
+    R_cw, weights = graph.T_cw[known, :3, :3], graph.gravity_sigma[known] ** -2.0
+    down = gtsam.Unit3(np.einsum("n,nji,nj->i", weights, R_cw, graph.gravity[known]))
+    attitudes = [
+        gtsam.AttitudeFactorPose3(
+            i, down, gtsam.noiseModel.Isotropic.Sigma(2, sigma), gtsam.Unit3(direction)
+        )
+        for i, sigma, direction in zip(
+            known.tolist(), graph.gravity_sigma[known].tolist(), graph.gravity[known], strict=True
+        )
+    ]
+    result = optimised_values(
+        graph,
+        [gtsam.Pose3(T_wc) for T_wc in inverses(graph.T_cw)],
+        [gtsam.Pose3(T_i_j) for T_i_j in graph.T_i_j],
+        graph.sigmas[:, ROTATION_FIRST],
+        (gtsam.PriorFactorPose3, gtsam.BetweenFactorPose3),
+        config,
+        hold=np.repeat([1.0, HOLD], 3),
+        factors=attitudes,
+    )
+    T_wc = np.array([result.atPose3(i).matrix() for i in range(len(graph.T_cw))])
+    T_cw = inverses(T_wc) @ (T_wc[fixed] @ graph.T_cw[fixed])
+    T_cw[fixed] = graph.T_cw[fixed]
+    return T_cw
+
+
 def optimised_values(
     graph: PoseGraph,
     poses: list[Any],
@@ -288,6 +359,9 @@ def optimised_values(
     sigmas: NDArray[np.float64],
     factor_types: tuple[Any, Any],
     config: PoseGraphConfig,
+    *,
+    hold: NDArray[np.float64] | None = None,
+    factors: Sequence[Any] = (),
 ) -> Any:
     """Find the ``gtsam.Values`` of the keyframes that agree best with the edges.
 
@@ -296,25 +370,29 @@ def optimised_values(
         measured: measurements of the E edges, as GTSAM objects of the same type.
         sigmas: ``(E, D)`` standard deviations of the edges.
         factor_types: GTSAM's prior factor and between factor for this type.
+        hold: ``(D,)`` standard deviations with which fixed keyframes are held; ``HOLD`` by default.
+        factors: further factors of GTSAM.
     """
     import gtsam
 
     noise = gtsam.noiseModel
     prior, between = factor_types
-    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    hold = noise.Isotropic.Sigma(sigmas.shape[1], HOLD)
+    whole, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    held = noise.Diagonal.Sigmas(np.full(sigmas.shape[1], HOLD) if hold is None else hold)
     for i, pose in enumerate(poses):
         start.insert(i, pose)
         if graph.fixed[i]:
-            factors.add(prior(i, pose, hold))
+            whole.add(prior(i, pose, held))
     cauchy = noise.mEstimator.Cauchy.Create(config.robust_scale)
     for (i, j), pose, kind, sigma in zip(
         graph.edges.tolist(), measured, graph.kind.tolist(), sigmas, strict=True
     ):
         plain = noise.Diagonal.Sigmas(sigma)
         model = noise.Robust.Create(cauchy, plain) if kind == LOOP else plain
-        factors.add(between(i, j, pose, model))
-    return minimised(factors, start)
+        whole.add(between(i, j, pose, model))
+    for factor in factors:
+        whole.add(factor)
+    return minimised(whole, start)
 
 
 def minimised(factors: Any, start: Any) -> Any:

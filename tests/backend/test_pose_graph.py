@@ -19,10 +19,13 @@ from vslam.backend.pose_graph import (
     edge_sigmas,
     essential_graph,
     optimise,
+    optimise_level,
+    with_gravity,
 )
 from vslam.config import PoseGraphConfig
 from vslam.types.features import Features
 from vslam.types.geometry import inverse, inverses, orthonormalised, se3_exp, se3_log
+from vslam.types.imu import GravityDirection
 from vslam.types.loops import LoopEdge, reversed_loop
 from vslam.types.map import UNPREDICTED, Map
 from vslam.types.map_kernels import covisible_pairs, link_many
@@ -496,3 +499,91 @@ def test_a_part_that_began_anew_is_joined_from_wherever_it_was(metres, yaw):
     assert verdict.consistent, verdict.reason
     assert position_error(inverses(lost)) > 2.0
     assert position_error(T_cw) < 1.0
+
+
+# ------------------------------------------------------------------------------ gravity
+
+DOWN = np.array([0.0, 1.0, 0.0])
+
+
+def sensed(T_wc: np.ndarray, sigma: float, seed: int = 0) -> dict[str, np.ndarray]:
+    """Return what an IMU at true poses measures of gravity, as fields of a pose graph."""
+    noise = np.random.default_rng(seed).normal(0.0, sigma, (len(T_wc), 3))
+    gravity = T_wc[:, :3, :3].transpose(0, 2, 1) @ DOWN + noise
+    gravity /= np.linalg.norm(gravity, axis=1)[:, None]
+    return {"gravity": gravity, "gravity_sigma": np.full(len(T_wc), max(sigma, 1e-3))}
+
+
+def tilts(T_cw: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return the angles in degrees between estimated and true directions of gravity."""
+    found, expected = T_cw[:, :3, :3] @ DOWN, true[:, :3, :3].transpose(0, 2, 1) @ DOWN
+    return np.degrees(np.arccos(np.clip((found * expected).sum(axis=1), -1.0, 1.0)))
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def test_a_map_with_an_imu_stays_level():
+    """The path drifts in roll and pitch. Loops alone spread this error over the laps."""
+    found = []
+    for seed in range(6):
+        T_wc, loops, measured = simulate(seed, drift=1.5)
+        true = route(len(T_wc))
+        graph = chain_graph(T_wc, loops, measured, reach=3)
+        level = optimise_level(replace(graph, **sensed(true, 0.003, seed)), CONFIG)
+        assert np.array_equal(level[0], graph.T_cw[0])
+        loop_errors = edge_errors(level, graph.edges, graph.T_i_j, graph.sigmas)[graph.kind == LOOP]
+        assert loop_errors.max() < CONFIG.max_loop_error
+        three = graph.T_cw, optimise(graph, CONFIG), level
+        heights = [rms((inverses(T_cw) - true)[:, 1, 3]) for T_cw in three]
+        found.append([rms(tilts(T_cw, true)) for T_cw in three] + heights)
+    drifted, closed, level, *heights = np.sqrt(np.mean(np.square(found), axis=0))
+    assert level < 0.5 * closed < 0.5 * drifted
+    assert level < 0.25
+    assert heights[2] < 0.8 * heights[1] < 0.8 * heights[0]
+
+
+def test_a_level_graph_stays_as_it_is():
+    true = route(150)
+    graph = replace(
+        chain_graph(true, [(149, 3)], [inverse(true[149]) @ true[3]]), **sensed(true, 0)
+    )
+    np.testing.assert_allclose(optimise_level(graph, CONFIG), graph.T_cw, atol=1e-7)
+
+
+def test_the_world_need_not_be_level():
+    """The first camera looks down by 0.4 rad and is rolled by 0.3 rad, and so is the world."""
+    T_wc, loops, measured = simulate(3, n=300)
+    known = sensed(route(300), 0.003)
+    graph = replace(chain_graph(T_wc, loops, measured), **known)
+    T_camera = se3_exp(np.array([0, 0, 0, 0.4, 0, 0.3]))  # from the other camera to the first one
+    R = T_camera[:3, :3]
+    other = chain_graph(
+        inverse(T_camera) @ T_wc @ T_camera, loops, inverse(T_camera) @ measured @ T_camera
+    )
+    other = replace(other, sigmas=graph.sigmas, **known | {"gravity": known["gravity"] @ R})
+    expected = inverse(T_camera) @ optimise_level(graph, CONFIG) @ T_camera
+    found = optimise_level(other, CONFIG)
+    apart = np.array([se3_log(a @ inverse(b)) for a, b in zip(found, expected, strict=True)])
+    assert np.abs(apart[:, :3]).max() < 0.02
+    assert np.abs(apart[:, 3:]).max() < np.radians(0.02)
+
+
+def test_measurements_of_gravity_within_the_memory_of_the_filter_count_as_one():
+    map_ = Map(1.2 ** np.arange(8))
+    for k in range(30):
+        if k == 20:
+            map_.begin_drive()
+        gravity = GravityDirection(DOWN, 0.01) if k >= 5 else None
+        map_.add_keyframe(Features.none(), np.eye(4), 0.1 * k, k, gravity=gravity)
+        map_.parents[k] = k - 1
+    graph = with_gravity(essential_graph(map_, [], CONFIG), map_)
+    expected = 0.01 * np.sqrt(np.repeat([0, 15, 10], [5, 15, 10]))
+    np.testing.assert_allclose(graph.gravity_sigma, expected)
+    assert np.array_equal(graph.gravity[5:], np.tile(DOWN, (25, 1)))
+    sparse = map_.copy()
+    sparse.keyframes.timestamp[:] *= 1000.0
+    graph = with_gravity(essential_graph(sparse, [], CONFIG), sparse)
+    np.testing.assert_allclose(graph.gravity_sigma[5:], 0.01)
+    assert map_.keyframes.gravity_sigma[10] == 0.01  # the map itself is not changed

@@ -11,17 +11,18 @@ import pytest
 from ring import CAMERA, LAP, Oracle, Ring
 
 from vslam.backend import pose_graph
-from vslam.backend.pose_graph import GAP, WEAK, connectivity
+from vslam.backend.loop_correction import move_keyframes
+from vslam.backend.pose_graph import GAP, WEAK, connectivity, essential_graph, optimise
 from vslam.config import Config, ConsistencyConfig, KeyframeConfig, LoopConfig
 from vslam.loopclosure.detector import NoDetector
 from vslam.loopclosure.verification import verify
 from vslam.loopclosure.verifier import Verifier
 from vslam.method.closing import LoopClosing
-from vslam.method.hypotheses import Hypothesis, joined_submaps, solve
+from vslam.method.hypotheses import Hypothesis, Solution, joined_submaps, solve
 from vslam.slam import Slam
 from vslam.types.context import Context
 from vslam.types.features import Extracted, Features, TrackingState
-from vslam.types.geometry import inverse
+from vslam.types.geometry import inverse, inverses, se3_exp
 from vslam.types.loops import LoopCandidate
 from vslam.types.map import UNPREDICTED
 
@@ -372,6 +373,32 @@ def test_a_loop_joins_two_submaps():
     map_, edge = open_loop("carried")
     assert set(joined_submaps(map_, [])) == {0, map_.restarts[0]}
     assert set(joined_submaps(map_, [edge])) == {0}
+
+
+def test_a_loop_keeps_the_map_level_where_gravity_is_known():
+    """The odometry tilts by two degrees along the ring, and an IMU has measured gravity."""
+    map_, edge = copy.deepcopy(open_loop("dark"))
+    living, down = map_.living_keyframes(), np.array([0.0, 1.0, 0.0])
+    true = np.array([DRIFTING.pose(ROUND[frame]) for frame in map_.frames[living].tolist()])
+    felt = true[:, :3, :3].transpose(0, 2, 1) @ down
+    angles = np.radians(2.0) * living / map_.n_keyframes
+    tilting = np.array([se3_exp(np.array([0, 0, 0, 0, 0, angle])) for angle in angles])
+    move_keyframes(map_, living, map_.arrays.T_cw[living] @ inverses(tilting))
+
+    def solved() -> tuple[Solution, float]:
+        config = Config().pose_graph
+        found = solve(map_, [], edge, Hypothesis.PREDICTED, config, monocular=False)
+        assert found.verdict.consistent
+        cosine = ((found.T_cw[:, :3, :3] @ down) * felt).sum(axis=1).clip(-1.0, 1.0)
+        return found, float(np.degrees(np.sqrt(np.mean(np.arccos(cosine) ** 2))))
+
+    plain, tilted = solved()
+    graph = essential_graph(map_, [edge], Config().pose_graph, driven=True)
+    assert plain.T_cw.tobytes() == optimise(graph, Config().pose_graph).tobytes()
+    map_.keyframes.gravity[living], map_.keyframes.gravity_sigma[living] = felt, 0.002
+    _, level = solved()
+    assert tilted > 0.4
+    assert level < 0.25 * tilted
 
 
 @pytest.mark.parametrize("threads", [1, 2])

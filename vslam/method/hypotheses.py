@@ -27,7 +27,9 @@ from vslam.backend.pose_graph import (
     connectivity,
     essential_graph,
     optimise,
+    optimise_level,
     parts_of,
+    with_gravity,
 )
 from vslam.backend.similarity_graph import (
     check_similarity_graph,
@@ -117,6 +119,9 @@ def solve(
     graph = replace(graph, T_cw=start[graph.keyframes])
     found = optimise(graph, config)
     verdict = check_pose_graph(graph, found, config)
+    level = with_gravity(graph, map_)
+    if verdict.consistent and level.gravity_sigma.any():
+        found = optimise_level(level, config)
     return Solution(graph, found, inverses(found), verdict, mistracked)
 
 

@@ -52,8 +52,8 @@ LONGEST_GAP = 0.1
 # poses of the last STRETCH_S seconds, of which at most MOST_POSES are used. Of a slow camera, the
 # last FEWEST_POSES poses are used, if they are at most LONGEST_S seconds old.
 START_S, RETRY_S, STRETCH_S, MOST_POSES = 0.5, 0.25, 1.0, 20
-FEWEST_POSES, LONGEST_S = 6, 2.5
-KEPT_S = 3.0  # s for which samples are kept
+FEWEST_POSES, LONGEST_S = 6, 4.0
+KEPT_S = 5.0  # s for which samples are kept
 # Stretches from which the scale of one camera is tried to be found, in seconds. The first poses of
 # a map are often so wrong that only a shorter stretch agrees with the samples. It is tried at most
 # every SCALE_RETRY_S seconds. A scale that is known is replaced by one whose standard deviation is
@@ -66,6 +66,7 @@ SIGMA_PX = 0.15
 # of the covariances that the images give are not independent from frame to frame, so those
 # covariances are multiplied by POSE_INFLATION, and are at least as large as these.
 SIGMA_M, SIGMA_RAD = 0.002, 0.0005
+SIGMA_PER_M = 0.005  # share of the distance between two frames, if that is larger than SIGMA_M
 POSE_INFLATION = 4.0
 REST_SIGMA = 0.01  # m/s, standard deviation of the velocity of a camera that stands still
 # A pose with a larger squared distance from its prediction is not used: 0.001 of six degrees of
@@ -321,7 +322,9 @@ def _started(inertia: Inertia, calibration: ImuCalibration) -> Inertia:
     inertia = replace(inertia, tried=now)
     step = -(-len(times) // MOST_POSES)
     chosen = slice((len(times) - 1) % step, None, step)  # the newest pose belongs to them
-    stretch = PoseStretch(times[chosen], inertia.poses[chosen], SIGMA_M, SIGMA_RAD)
+    moved = np.linalg.norm(np.diff(inertia.poses[:, :3, 3], axis=0), axis=1)
+    sigma_m = max(SIGMA_M, SIGMA_PER_M * float(np.median(moved)))
+    stretch = PoseStretch(times[chosen], inertia.poses[chosen], sigma_m, SIGMA_RAD)
     found = find_gravity(stretch, inertia.samples, calibration, known_scale=True)
     if found is None:
         return inertia

@@ -105,6 +105,7 @@ def test_rotation_and_offset_are_measured_and_written(call, drive, sensor, degre
     code, out, _ = call(*words(drive, sensor))
     assert code == 0
     assert "agrees with the measurement, so nothing is written" in out
+    assert "new:" not in out
     assert not Path("rig-2.yaml").exists()
 
 

@@ -198,7 +198,7 @@ def _calibrate_imu(given: SourceOptions, out: Path | None) -> None:
         f"measured: time_offset {1e3 * alignment.time_offset:+.2f} ms, standard deviation "
         f"{1e3 * alignment.sigma:.2f} ms"
     )
-    for name, one in (("old", found.old), ("new", new)):
+    for name, one in (("old", found.old), ("new", new if found.replaced else None)):
         if one is not None:
             typer.echo(f"{name}: T_imu_camera {rotation_text(one.T_imu_camera)}")
             typer.echo(f"{name}: time_offset {1e3 * one.time_offset:+.2f} ms")

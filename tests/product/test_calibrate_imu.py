@@ -14,8 +14,17 @@ from inertial import ADIS16448, EUROC, Flight
 from scipy.spatial.transform import Rotation
 
 from vslam.calibration.files import read_calibration
+from vslam.calibration.models import Calibration, CameraModel
+from vslam.calibration.rectification import rectify
+from vslam.config import Config
+from vslam.datasets.frames import Source, stored_frames
+from vslam.datasets.imu import Imu
 from vslam.datasets.imu_csv import HEADER
+from vslam.doctor import imu_calibration
+from vslam.doctor.imu_calibration import measure_imu
+from vslam.run.imu_alignment import align
 from vslam.types.camera import Camera
+from vslam.types.geometry import se3_exp
 from vslam.types.imu import GRAVITY
 
 CAMERA = Camera(240.0, 240.0, 239.5, 79.5, 0.5, 480, 160)
@@ -107,6 +116,33 @@ def test_rotation_and_offset_are_measured_and_written(call, drive, sensor, degre
     assert "agrees with the measurement, so nothing is written" in out
     assert "new:" not in out
     assert not Path("rig-2.yaml").exists()
+
+
+def test_the_rotation_is_that_of_the_left_camera_before_rectification(monkeypatch):
+    one = CameraModel(240.0, 240.0, 239.5, 79.5, 480, 160)
+    T_left_right = se3_exp(np.array([0.5, 0.0, 0.0, 0.08, 0.0, 0.0]))
+    calibration = Calibration(one, one, T_left_right)
+    rectification = rectify(calibration)
+    R = rectification.R_left_rectified
+    assert Rotation.from_matrix(R).magnitude() == pytest.approx(0.04)
+
+    times, noise = 20.0 + 0.05 * np.arange(120), np.random.default_rng(0)
+    rotations = np.array([ABOUT_ALL_AXES.rotation(t) for t in times]) @ R
+    rotations = rotations @ Rotation.from_rotvec(noise.normal(0, 1e-4, (120, 3))).as_matrix()
+    samples = ABOUT_ALL_AXES.samples(np.arange(19.5, 26.5, 0.005), None, ADIS16448)
+    samples[:, 1:4] = samples[:, 1:4] @ R_IMU_CAMERA.T
+    source = Source(
+        dataset="test", name="drive", camera=rectification.camera,
+        stored=stored_frames(times, lambda k, image_map: (np.zeros((160, 480), np.uint8), None)),
+        imu=Imu("imu.csv", lambda: samples), calibration=calibration,
+    )  # fmt: skip
+    found = align(times, rotations, samples)
+    monkeypatch.setattr(imu_calibration, "measure_alignment", lambda *_: found)
+    imu = measure_imu(source, Config()).new.imu
+    assert imu is not None
+    assert turn(imu.T_imu_camera[:3, :3]) < 0.2
+    assert found is not None
+    assert turn(found.R_imu_camera) > 2.0
 
 
 def test_what_contradicts_is_replaced_and_both_are_shown(call, drive):

@@ -125,14 +125,14 @@ class TrackingConfig(Section):
     few patches are found. `auto` is `patches` for stereo and `orb` otherwise. RGB-D cameras are
     never tracked by patches. [own]"""
     patch_min_inliers: int = Field(40, ge=10)
-    """Features are extracted if fewer patches agree with the pose. [own]"""
+    """Features are extracted if fewer patches than this agree with the pose. [own]"""
     patch_min_inlier_ratio: float = Field(0.8, ge=0, le=1)
-    """Features are extracted if a smaller fraction of the patches agrees with the pose, as among
-    moving vehicles. [own]"""
+    """Features are extracted if less than this fraction of the patches agrees with the pose, as
+    among moving vehicles. [own]"""
     patch_retry_ratio: float = Field(0.86, ge=0, le=1)
-    """If a smaller fraction of the patches agrees with the pose, they are searched for again from
-    the predicted pose, because sparse image alignment, which precedes the first search, may have
-    followed moving objects. The result with more inliers is used. [own]"""
+    """If less than this fraction of the patches agrees with the pose, they are searched for again
+    from the predicted pose, because sparse image alignment, which precedes the first search, may
+    have followed moving objects. The result with more inliers is used. [own]"""
     motion_window: float = Field(7.0, gt=0)
     """Search radius for points of the previous frame, in pixels at octave 0. [OS1 V-B,
     customary]"""
@@ -147,11 +147,11 @@ class TrackingConfig(Section):
     min_stereo_start: int = Field(100, ge=10)
     """Stereo features that a frame needs to start a map. [OS2 III-B, own]"""
     min_inlier_ratio: float = Field(0.3, ge=0, le=1)
-    """If a smaller fraction of the matches with the previous frame are inliers, the frame is also
-    tracked from the reference keyframe. [own]"""
+    """If less than this fraction of the matches with the previous frame are inliers, the frame is
+    also tracked from the reference keyframe. [own]"""
     min_inliers: int = Field(30, ge=3)
-    """A frame with fewer inliers in the local map is WEAK: its pose is used, but reported as
-    uncertain. [OS1 V-D, customary]"""
+    """A frame with fewer inliers than this in the local map is WEAK: its pose is used, but reported
+    as uncertain. [OS1 V-D, customary]"""
     lost_frames_before_restart: int = Field(3, ge=1)
     """Lost frames after which a stereo or RGB-D camera starts a sub-map at the predicted pose.
     [own]"""
@@ -168,7 +168,7 @@ class InitializationConfig(Section):
     min_features: int = Field(200, ge=20)
     """Features that a frame needs to be the first view. [own]"""
     min_matches: int = Field(100, ge=8)
-    """With fewer matches, the second view replaces the first. [OS1 IV, customary]"""
+    """With fewer matches than this, the second view replaces the first. [OS1 IV, customary]"""
     min_parallax_deg: float = Field(1.0, gt=0)
     """Parallax that 50 points must have, in degrees. A larger value needs a longer motion. [OS1 IV,
     customary]"""
@@ -191,10 +191,11 @@ class KeyframeConfig(Section):
     """Replaces `max_interval_s` for RGB-D cameras, which are usually hand-held, in seconds.
     [own]"""
     min_tracked_close: int = Field(100, ge=0)
-    """A keyframe is inserted if the frame tracks fewer close points, and could add more than
-    `min_new_close`. [OS2 III-E, printed]"""
+    """A keyframe is inserted if the frame tracks fewer close points than this, and could add more
+    than `min_new_close`. [OS2 III-E, printed]"""
     min_new_close: int = Field(70, ge=0)
-    """Such a frame must be able to add more new close points than this. [OS2 III-E, printed]"""
+    """A frame with fewer tracked close points must be able to add more new ones than this. [OS2
+    III-E, printed]"""
     patch_kept_close: float = Field(0.4, ge=0, le=1)
     """A frame tracked by patches becomes a keyframe if it tracks less than this fraction of the
     close points that the first frame after the last keyframe tracked. [own]"""
@@ -228,8 +229,8 @@ class MappingConfig(Section):
     """Upper bound of the descriptor distance between duplicate landmarks, in bits. [OS1 VI-C,
     customary]"""
     min_stereo_points: int = Field(100, ge=0)
-    """A keyframe with fewer close stereo features maps its nearest ones, up to this number. [OS2
-    III-E, printed]"""
+    """A keyframe with fewer close stereo features than this maps its nearest ones, up to this
+    number. [OS2 III-E, printed]"""
     redundant_ratio: float = Field(0.9, gt=0, le=1)
     """A keyframe is culled if more than this fraction of its landmarks are observed by at least
     three other keyframes each. A larger fraction keeps more keyframes. [OS1 VI-E, printed]"""
@@ -269,8 +270,8 @@ class LearnedMatchingConfig(Section):
     retry_interval: int = Field(8, ge=0)
     """Keyframes after a failed attempt during which `retry_factor` applies. [own]"""
     retry_factor: float = Field(1.1, ge=1)
-    """A place is then tried only if its similarity is at least this many times that of the failed
-    attempt. [own]"""
+    """After a failed attempt, a place is tried only if its similarity is at least this many times
+    that of the failed attempt. [own]"""
     min_inliers: int = Field(80, ge=6)
     """Inliers that must remain after guided search. [own]"""
     verified_memory: int = Field(10, ge=1)
@@ -284,7 +285,8 @@ class ConsistencyConfig(Section):
     min_keyframes: int = Field(2, ge=1)
     """Consecutive keyframes that must resemble the place. OS1 requires 3. [OS1 VII-A, own]"""
     max_gap: int = Field(1, ge=0)
-    """Keyframes between two of them that need not resemble it. OS1 allows none. [OS1 VII-A, own]"""
+    """Keyframes that need not resemble the place between two that do. OS1 allows none. [OS1 VII-A,
+    own]"""
     max_wrong: float = Field(3e-3, gt=0, le=0.5)
     """A loop is closed only if the probability that it is wrong is at most this, by its own
     evidence and that of a loop that agrees with it. [own]"""
@@ -401,9 +403,9 @@ class SiameseConfig(Section):
     """Fraction of the distance travelled since the keyframe. The default is several times the drift
     of a stereo camera in a street, about 1 %. [own]"""
     monocular_reach_share: float = Field(0.3, ge=0)
-    """Replaces both in monocular maps, whose scale drifts: the query is compared only with
-    keyframes nearer than this fraction of the distance travelled since. The default is twice what
-    KITTI 00 needs, where the scale drifts by a factor of 2.3. [own]"""
+    """Replaces both values in monocular maps, whose scale drifts: the query is compared only with
+    keyframes nearer than this fraction of the distance travelled since them. The default is twice
+    what KITTI 00 needs, where the scale drifts by a factor of 2.3. [own]"""
     reach_angle: float = Field(60.0, gt=0, le=180)
     """The query is compared only with keyframes whose viewing direction differs by at most this, in
     degrees. The detectors do not recognise a place from behind or from the side. [own]"""

@@ -14,9 +14,9 @@ The fields of a line, separated by ``|``, are:
 - A field for each further cell of the table's row. The field lists columns of the file. The cell
   must show the values of these columns, rounded as in the cell. The last field also applies to all
   further cells. If a field is empty, its cell is not compared. A filter in parentheses applies to
-  the columns that precede it in the field. ``mean x``, ``median x`` and ``sum x`` stand for the
-  mean, median and sum of column x over all selected rows. ``each x`` stands for all values of
-  column x in these rows, in the order of the file. Empty values are left out.
+  the columns that precede it in the field. ``mean x``, ``median x``, ``sum x`` and ``max x`` stand
+  for the mean, median, sum and maximum of column x over all selected rows. ``each x`` stands for
+  all values of column x in these rows, in the order of the file. Empty values are left out.
 
 A line that contains only ``-`` skips a row. A comment may also stand before a paragraph. Such a
 comment names columns whose values the paragraph must mention.
@@ -36,7 +36,7 @@ COMMENT = re.compile(r"<!-- from:(.*?)-->[ ]*\n", re.DOTALL)
 TABLE = re.compile(r"(--> *\n)?(?:^ *\|.*\n)+?^ *\|[-| :]+\|\n((?:^ *\|.*\n?)+)", re.MULTILINE)
 DECIMAL = re.compile(r"\d\.\d")
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:,\d{3})*(?:\.\d+)?")
-OVER_ROWS = {"mean": mean, "median": median, "sum": sum}
+OVER_ROWS = {"mean": mean, "median": median, "sum": sum, "max": max}
 
 
 def lines_of(comment: str) -> list[str]:

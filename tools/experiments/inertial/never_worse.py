@@ -1,0 +1,67 @@
+"""Compare ordinary drives with and without the IMU: it must not make them worse.
+
+    python tools/experiments/inertial/never_worse.py --out never_worse.csv
+
+``rpe_m`` and ``rpe_deg`` are errors of the motion over one second. ``gravity_2s_deg`` is the error
+of gravity two seconds after it was found, and ``gravity_deg`` the largest one from then on.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from drives import SYSTEMS, Run, ate, built_in, drive_of, rpe, write_rows
+
+from vslam_lab.towns import Route, cache_folder
+
+DRIVES = (
+    ("room", 25), ("room", 26), ("hall", 25), ("hall", 26), ("walk", 25), ("walk", 26),
+    ("drone", 25), ("demo", 25), ("00", 25), ("03", 25),
+)  # fmt: skip
+SECONDS = 14.0
+
+
+def gravity_errors(run: Run, route: Route) -> tuple[float, float, float]:
+    """Return when gravity was found, its error two seconds later, and the largest later error."""
+    down = route.T_wc[0, 1, :3]
+    known = np.flatnonzero(~np.isnan(run.gravity[:, 0]))
+    if not len(known):
+        return np.nan, np.nan, np.nan
+    cosine = run.gravity @ down / np.linalg.norm(run.gravity, axis=1)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    later = known[0] + round(2.0 * route.rate)
+    return known[0] / route.rate, float(angle[later]), float(np.nanmax(angle[later:]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--towns", type=Path, default=cache_folder())
+    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=["vslam"])
+    parser.add_argument("--first", type=int, default=len(DRIVES), help="only the first drives")
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    rows: list[dict[str, object]] = []
+    for name, seed in DRIVES[: options.first]:
+        route = built_in(name, seed)
+        frames = slice(0, round(SECONDS * route.rate))
+        drive = drive_of(route, seed, options.towns, frames=frames)
+        for system in options.systems:
+            for imu in (True, False):
+                run = SYSTEMS[system](drive, imu=imu)
+                metres, degrees = rpe(run.final, drive.T_wc, round(route.rate))
+                since, soon, later = gravity_errors(run, route)
+                rows.append({
+                    "drive": f"{name}, seed {seed}", "system": system,
+                    "imu": "yes" if imu else "no",
+                    "frames": len(drive.times), "lost": int(run.lost.sum()),
+                    "ate_m": ate(run.final, drive.T_wc), "rpe_m": metres, "rpe_deg": degrees,
+                    "gravity_since_s": since, "gravity_2s_deg": soon, "gravity_deg": later,
+                })  # fmt: skip
+                print(rows[-1], flush=True)
+    write_rows(options.out, rows)
+
+
+if __name__ == "__main__":
+    main()

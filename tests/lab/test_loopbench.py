@@ -348,6 +348,16 @@ def test_report_says_who_wins_in_all_three_files(vocabulary, tmp_path):
         (["--detectors", "bow", "--perturb", "fog"], "--perturb fog"),
         (["--detectors", "bow", "--data", "kitti:/nowhere"], "/nowhere"),
         (["--detectors", "bow", "--out", f"{__file__}/x"], "give another folder with --out"),
+        (
+            ["--protocol", "online", "--perturb", "light"],
+            "--perturb, --strengths, --seed: only for",
+        ),
+        (["--protocol", "online", "--seed", "1"], "--perturb, --strengths, --seed: only for"),
+        (["--protocol", "online", "--window", "x"], "--window x: must be a positive"),
+        (["--protocol", "online", "--detectors", "magic"], "--detectors magic: unknown"),
+        (["--protocol", "online", "--data", "town:demo"], "--protocol online needs drives"),
+        (["--window", "30s"], "--window: only for --protocol online"),
+        (["--detectors", "bow", "--weights", "bow=x"], "x: no such file; give a vocabulary"),
     ],
 )
 def test_command_refuses_in_one_sentence(arguments, said, tmp_path, monkeypatch):

@@ -311,29 +311,6 @@ def test_a_drive_is_measured_before_and_after_verification_and_reported(tmp_path
     assert "| walls <a> | 7      | 2            | 2 images | nothing     | 0.000 (0.000) |" in text
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (
-            ["--protocol", "online", "--perturb", "light"],
-            "--perturb, --strengths, --seed: only for",
-        ),
-        (["--protocol", "online", "--seed", "1"], "--perturb, --strengths, --seed: only for"),
-        (["--protocol", "online", "--window", "x"], "--window x: must be a positive"),
-        (["--protocol", "online", "--detectors", "magic"], "--detectors magic: unknown"),
-        (["--protocol", "online", "--data", "town:demo"], "--protocol online needs drives"),
-        (["--window", "30s"], "--window: only for --protocol online"),
-        (["--detectors", "bow", "--weights", "bow=x"], "x: no such file; give a vocabulary"),
-    ],
-)
-def test_command_refuses_in_one_sentence(arguments, said, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(every_command(), ["loops", "bench", *arguments])
-    assert isinstance(result.exception, InputError)
-    assert said in str(result.exception)
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.slow
 def test_command_on_a_rendered_drive(tmp_path, monkeypatch):
     monkeypatch.setenv("VSLAM_CACHE", str(tmp_path / "cache"))

@@ -74,13 +74,20 @@ Drawing = tuple[str, str, Figure]  # name, caption and figure
 
 def new_figure(title: str, x_label: str, y_label: str, height: float) -> tuple[Figure, Axes]:
     """Create a figure with one plot. The title is at the upper left. ``height`` is in inches."""
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = empty_figure(title, height)
     axes = figure.add_subplot()
-    figure.suptitle(title, x=0.01, ha="left", color=INK)
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.tick_params(length=3)
     return figure, axes
+
+
+def empty_figure(title: str, height: float) -> Figure:
+    """Create a figure without a plot. ``height`` is in inches."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    if title:
+        figure.suptitle(title, x=0.01, ha="left", color=INK)
+    return figure
 
 
 def add_legend(figure: Figure, axes: Axes) -> None:

@@ -95,9 +95,14 @@ def _markdown_part(part: Part) -> str:
     return ""
 
 
+def page_files(page: Page, stem: str) -> dict[str, str]:
+    """Format a page as Markdown and as HTML, by file name."""
+    return {f"{stem}.md": markdown(page), f"{stem}.html": html(page)}
+
+
 def html(page: Page) -> str:
     """Format a page as self-contained HTML, which loads no other files."""
-    return fill_template("report.html.jinja", page=page)
+    return fill_template("page.html.jinja", page=page)
 
 
 def fill_template(template: str, **values: object) -> str:

@@ -358,7 +358,7 @@ def machine_rows(report: ReportJson) -> list[tuple[str, str]]:
     machine = report.machine
     packages = {name: text for name, text in report.versions.items() if name != "python"}
     return [
-        ("CPU", f"{machine.cpu}, {counted(machine.cores, 'core')}"),
+        ("CPU", str(machine)),
         ("platform", machine.platform),
         ("Python", machine.python),
         ("packages", ", ".join(f"{name} {text}" for name, text in packages.items())),

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from vslam.method.gaps import GapKind
-from vslam.support.errors import InputError
+from vslam.support.errors import InputError, counted
 
 
 class Record(BaseModel):
@@ -226,6 +226,9 @@ class Machine(Record):
     cores: int
     python: str
     platform: str
+
+    def __str__(self) -> str:
+        return f"{self.cpu}, {counted(self.cores, 'core')}"
 
 
 class ReportJson(Measures, Document):

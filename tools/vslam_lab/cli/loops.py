@@ -167,11 +167,10 @@ def _write(out: Path, seed: int, **found: object) -> None:
     from vslam_lab.loopbench.report import write_report
     from vslam_lab.loopbench.schema import LoopsJson
 
-    here = this_machine()
     report = {
         **found,
         "seed": seed,
-        "machine": f"{here.cpu}, {counted(here.cores, 'core')}",
+        "machine": str(this_machine()),
         "versions": versions(),
         "created": datetime.now(UTC),
     }

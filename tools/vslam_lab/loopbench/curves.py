@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from vslam.report import page
@@ -16,10 +15,10 @@ from vslam.report.drawing import (
     INK,
     RED,
     VIOLET,
-    WIDTH,
     Drawing,
     add_legend,
     draw,
+    empty_figure,
 )
 from vslam_lab.loopbench.schema import Curve, DecisionCurve, LoopsJson
 
@@ -79,10 +78,7 @@ def _drawings(report: LoopsJson) -> Iterator[Drawing]:
 def _panels(title: str, names: list[str], lines: Iterable[Line]) -> Figure:
     columns = min(2, len(names))
     rows = -(-len(names) // columns)
-    figure = Figure(figsize=(WIDTH, 0.7 + 1.8 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
-    if title:
-        figure.suptitle(title, x=0.01, ha="left", color=INK)
+    figure = empty_figure(title, 0.7 + 1.8 * rows)
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axes in grid.flat[len(names) :]:
         axes.set_axis_off()

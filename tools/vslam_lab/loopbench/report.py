@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from vslam.report.page import Bullets, Page, Pairs, Section, Table
-from vslam.report.render import html, markdown, write_files
+from vslam.report.render import page_files, write_files
 from vslam.support.errors import counted
 from vslam_lab.loopbench.curves import draw_curves
 from vslam_lab.loopbench.measure import LENGTH, MIN_CONFIRMED, MIN_MATCHES, TOP
@@ -75,9 +75,7 @@ def write_report(report: LoopsJson, out: Path) -> None:
     Raises:
         ResultsError: a file cannot be written.
     """
-    page = loops_page(report)
-    files = {"loops.json": report.to_json(), "loops.md": markdown(page), "loops.html": html(page)}
-    write_files(out, files)
+    write_files(out, {"loops.json": report.to_json(), **page_files(loops_page(report), "loops")})
 
 
 def loops_page(report: LoopsJson) -> Page:

@@ -198,8 +198,7 @@ def _entry(report: ReportJson, folder: Path) -> RunEntry:
             for name, *_ in MEASURES
         },
         source=str(folder),
-        machine=f"{report.machine.cpu}, {counted(report.machine.cores, 'core')}, "
-        f"{counted(report.threads, 'thread')}",
+        machine=f"{report.machine}, {counted(report.threads, 'thread')}",
     )
 
 

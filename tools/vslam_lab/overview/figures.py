@@ -25,6 +25,7 @@ from vslam.report.drawing import (
     Drawing,
     add_legend,
     draw,
+    empty_figure,
     finish_map,
     new_figure,
     plain_ticks,
@@ -119,8 +120,7 @@ def _curve(
     strength: dict[Drive, float],
     looks: Looks,
 ) -> Figure:
-    figure, axes = new_figure(title, "", "ATE RMSE (m)", 1.7 * LOW)
-    axes.remove()
+    figure = empty_figure(title, 1.7 * LOW)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
     for name in systems(rows):
         mine = sorted((r for r in rows if r.system == name), key=lambda r: strength[r.drive])

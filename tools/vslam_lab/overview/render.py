@@ -8,7 +8,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from vslam.report.page import Bullets, Figure, Page, Pairs, Section, Table, number
-from vslam.report.render import csv_text, html, markdown, write_files
+from vslam.report.render import csv_text, page_files, write_files
 from vslam.support.errors import counted
 from vslam_lab.overview.collect import Found, collect
 from vslam_lab.overview.figures import draw_overview
@@ -71,9 +71,9 @@ def write_overview(
     figures = draw_overview(report, found)
     notes = list(dict.fromkeys((*report.notes, *found.notes)))  # drawing can add notes
     report = report.model_copy(update={"notes": notes})
-    page = overview_page(report, figures, _pages(found, out))
     files = {"report.json": report.to_json(), "table.csv": render_csv(report)}
-    write_files(out, {**files, "report.md": markdown(page), "report.html": html(page)})
+    page = overview_page(report, figures, _pages(found, out))
+    write_files(out, files | page_files(page, "report"))
     return report
 
 

@@ -17,7 +17,7 @@ from vslam.report.drawing import (
     VIOLET,
     add_legend,
     draw,
-    new_figure,
+    empty_figure,
     plain_ticks,
 )
 
@@ -53,8 +53,7 @@ def draw_curves(report: StressJson) -> list[page.Figure]:
 def _curves(
     sequence: str, law: str, entries: list[BoundaryEntry], colors: dict[str, str]
 ) -> Figure:
-    figure, axes = new_figure(f"{sequence}: {law}", "", "", 1.9 * LOW)
-    axes.remove()
+    figure = empty_figure(f"{sequence}: {law}", 1.9 * LOW)
     panels = figure.subplots(len(_PANELS), 1, sharex=True, height_ratios=[3, 3, 2])
     named: set[str] = set()
     for entry in entries:

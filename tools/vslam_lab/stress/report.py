@@ -15,7 +15,7 @@ import numpy as np
 from vslam.datasets.frames import Source
 from vslam.datasets.perturbation import law_kind, sheet_of_laws
 from vslam.report.page import Bullets, Figure, Page, Row, Section, Table, number
-from vslam.report.render import csv_text, html, markdown, write_files
+from vslam.report.render import csv_text, page_files, write_files
 from vslam.support.errors import InputError, counted
 from vslam_lab.stress.criterion import ABSOLUTE
 from vslam_lab.stress.figures import draw_curves
@@ -51,8 +51,7 @@ def write_report(out: Path, report: StressJson, sequences: Mapping[str, Source])
             "stress.json": report.to_json(),
             **({"boundaries.csv": render_csv(report)} if report.boundaries else {}),
             **{figure.file: figure.image for figure in sheet},
-            "report.md": markdown(page),
-            "report.html": html(page),
+            **page_files(page, "report"),
         },
         "free some space and repeat the command: finished runs are kept",
     )

@@ -376,7 +376,7 @@ def test_the_command(kitti_tree, tmp_path):
 @pytest.mark.slow
 def test_the_command_looks_at_the_beginning_of_a_video(corridor, tmp_path, monkeypatch):
     """The frames of a stream cannot be read again. Therefore, the first frames are kept."""
-    monkeypatch.setattr("vslam.datasets.frames.FIRST_FRAMES", 9)
+    monkeypatch.setattr("vslam.datasets.frames.first_frames.__defaults__", (9,))
     pairs = [np.hstack(pair) for pair in zip(corridor.left, corridor.right, strict=True)]
     video = write_video(tmp_path / "drive.mkv", pairs)
     calibration = write_calibration(tmp_path / "stereo.yaml", corridor.camera)

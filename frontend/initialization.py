@@ -51,6 +51,11 @@ _MIN_POINT_SHARE = 0.7
 # that the best motion explains. An ambiguous motion is rejected. [OS1 IV, customary]
 _MAX_RIVAL_SHARE = 0.7
 
+# The parallax of `_MIN_POINTS` points must also be at least this fraction of `min_parallax_deg`
+# if the best rotation between the views is taken from the flow. [own]
+_MIN_LEFT = 0.75
+_ROTATIONS = 8  # iterations that find this rotation
+
 CHI2_LINE = 3.841  # 95 % quantile of chi-square with 1 degree of freedom: distance from a line
 # Matches per sample. The eight-point algorithm needs all of them; a homography needs only four.
 SAMPLE = 8
@@ -163,8 +168,33 @@ def reconstruct(
         or widest[-1] > np.cos(np.radians(config.min_parallax_deg))
     ):
         return None
+    left = np.sort(angles_after_rotation(xy_1[match], xy_2[match], camera))[-_MIN_POINTS]
+    if left < _MIN_LEFT * np.radians(config.min_parallax_deg):
+        return None
     kept = good & (cosine < MAX_COSINE)
     return TwoViews(motions[best], match[kept], points[kept])
+
+
+def angles_after_rotation(xy_1: Matrix, xy_2: Matrix, camera: Camera) -> Matrix:
+    """Compute the ``(N,)`` angles between the rays of two views, in radians, that are left after
+    the rotation that explains most of them.
+
+    They are a lower bound of the parallax that does not depend on an estimated translation. The
+    parallax of a wrong translation can be large, because its points are too near.
+
+    Args:
+        xy_1, xy_2: ``(N, 2)`` matched pixels.
+    """
+    rays = [camera.backproject(xy, np.ones(len(xy))) for xy in (xy_1, xy_2)]
+    one, two = (ray / np.linalg.norm(ray, axis=1)[:, None] for ray in rays)
+    weight = np.ones(len(one))
+    for _ in range(_ROTATIONS):
+        U, _, Vt = np.linalg.svd((weight[:, None] * two).T @ one)
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        angles = np.linalg.norm(two - one @ R.T, axis=1)
+        # Least absolute differences by iteratively reweighted least squares
+        weight = 1.0 / np.maximum(angles, max(float(np.median(angles)), 1e-9))
+    return angles
 
 
 def select_model(xy_1: Matrix, xy_2: Matrix, sigma: Matrix, *, seed: int) -> TwoViewModel:

@@ -53,7 +53,7 @@ _MAX_RIVAL_SHARE = 0.7
 
 # The parallax of `_MIN_POINTS` points must also be at least this fraction of `min_parallax_deg`
 # if the best rotation between the views is taken from the flow. [own]
-_MIN_LEFT = 0.75
+_MIN_LEFT = 0.4
 _ROTATIONS = 8  # iterations that find this rotation
 
 CHI2_LINE = 3.841  # 95 % quantile of chi-square with 1 degree of freedom: distance from a line

@@ -213,6 +213,7 @@ def _optimised(
         context.config.alignment.certainty * scale**-2.0,
         context.camera.intrinsics,
         trusted=trusted[found.seen] if ask_trusted else None,
+        confirmed=local.confirmed[found.seen],
     )
     seen, xy, level = found.seen[inlier], found.xy[inlier], found.level[inlier]
     features = Features(

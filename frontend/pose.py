@@ -30,6 +30,7 @@ def optimise_pose(
     disparity_weight: NDArray[np.float64] | None = None,
     *,
     trusted: NDArray[np.bool_] | None = None,
+    confirmed: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Find the camera pose that minimises the robust reprojection error of fixed landmarks.
 
@@ -38,7 +39,9 @@ def optimise_pose(
 
     A moving object may have more landmarks than the static scene. If too few trusted landmarks
     agree with the pose, they alone determine a first pose. Only observations that agree with the
-    first pose are then used, whether they are trusted or not.
+    first pose are then used, whether they are trusted or not. A few trusted landmarks in a corner
+    of the image can also give a wrong pose. It is not used if fewer confirmed landmarks agree with
+    it.
 
     Args:
         T_cw: ``(4, 4)`` initial pose (world to camera).
@@ -51,6 +54,8 @@ def optimise_pose(
             standard deviation of the disparity; None uses the ratio in ``intrinsics``.
         trusted: ``(N,)`` bool, True for landmarks that are known to be at rest. None if it is
             unknown for all of them.
+        confirmed: ``(N,)`` bool, True for these and for confirmed landmarks that are far; None if
+            there are no others.
 
     Returns:
         The pose ``T_cw``, ``(4, 4)``, and an ``(N,)`` bool mask of the inliers. There are no
@@ -78,6 +83,8 @@ def optimise_pose(
         return T_found, inlier
     agree = np.empty(len(points), np.bool_)
     _classify(T_trusted, points, uvr, inverse_sigma2, disparity_weight, intrinsics, agree)
+    if confirmed is not None and np.sum(agree & confirmed) < np.sum(inlier & confirmed):
+        return T_found, inlier
     T_found, kept = optimised(T_trusted, agree)
     agree[agree] = kept
     return T_found, agree

@@ -398,12 +398,12 @@ def refine(
         shift: ``Track.shift`` of the matches; None if no match is aligned.
     """
     matched, track = np.flatnonzero(np.isfinite(track.xyz[:, 0])), replace(track, shift=shift)
+    confirmed = local.confirms(track.landmark[matched])
     T_found, inlier = optimise_pose(
         T_cw,
         *_observed_points(track, matched, context),
-        trusted=trusted_landmarks(
-            local.confirms(track.landmark[matched]), track.xyz[matched], T_cw, context
-        ),
+        trusted=trusted_landmarks(confirmed, track.xyz[matched], T_cw, context),
+        confirmed=confirmed,
     )
     inliers = track.without(matched[~inlier])
     return replace(inliers, T_cw=T_found, n_inliers=int(np.count_nonzero(inlier)))

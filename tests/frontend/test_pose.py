@@ -219,6 +219,20 @@ def test_trusted_landmarks_that_contradict_each_other_do_not_decide(n_agree, exp
     assert pose_difference(T, expected) < 1e-6
 
 
+def test_trusted_landmarks_do_not_decide_against_more_confirmed_ones():
+    """The landmarks nearby agree with another pose than those farther away, which are more."""
+    points, uvr = seen_from((TRUTH, 20.0, 300), (OBJECT, 20.0, 40))
+    trusted = np.arange(340) >= 300
+    T, _ = follow(points, uvr, trusted)
+    assert pose_difference(T, OBJECT) < 1e-6
+    weight, confirmed = np.ones(340), np.ones(340, np.bool_)
+    T, inlier = optimise_pose(
+        TRUTH, points, uvr, weight, CAMERA.intrinsics, trusted=trusted, confirmed=confirmed
+    )
+    assert pose_difference(T, TRUTH) < 1e-6
+    np.testing.assert_array_equal(inlier, ~trusted)
+
+
 @pytest.mark.parametrize(("n_far", "expected"), [(70, OBJECT), (69, TRUTH)])
 def test_a_pose_with_which_most_trusted_landmarks_agree_is_kept(n_far, expected):
     """Landmarks that are 4 km away agree with both poses."""

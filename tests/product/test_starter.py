@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from parts import ALL, CAMERA, Points, frame_of
@@ -32,6 +34,13 @@ def frame(index: int, seconds: float, moved: float = 0.0, among: slice = ALL) ->
     return frame_of(features, index, seconds)
 
 
+def offered_twice(one: Starter, track: Track) -> TwoViewStart | None:
+    """Offer a frame, and then the same view again as a later frame, which must confirm it."""
+    assert one.offer(track, None) is None
+    again = replace(track, index=track.index + 1, timestamp=track.timestamp + 1e-4)
+    return one.offer(again, None)
+
+
 # -- two views ------------------------------------------------------------------------------------
 
 
@@ -45,10 +54,10 @@ def test_a_frame_with_enough_features_waits_for_a_second_view(n_features, enough
 def test_two_views_from_different_places_begin_a_map():
     one, first, second = starter(), frame(0, 0.0), frame(1, 0.5, 1.0)
     assert one.offer(first, None) is None
-    start = one.offer(second, None)
+    start = offered_twice(one, second)
     assert isinstance(start, TwoViewStart)
     assert start.first is first
-    assert start.second is second
+    assert start.second.index == second.index + 1
     assert not start.predicted
     np.testing.assert_array_equal(start.features[0], start.features[1])  # the same points
     seen = POINTS.xyz[start.features[0]]
@@ -59,7 +68,7 @@ def test_two_views_from_different_places_begin_a_map():
     truth = se3_exp(ASIDE)
     truth[:3, 3] *= unit
     np.testing.assert_allclose(start.T_2_1, truth, atol=1e-3)
-    np.testing.assert_allclose(start.twist, se3_log(start.T_2_1) / 0.5)
+    np.testing.assert_allclose(start.twist, se3_log(start.T_2_1) / 0.5001)
     assert one.is_waiting  # until the map has begun
     one.reset()
     assert not one.is_waiting
@@ -69,21 +78,22 @@ def test_a_camera_that_stands_begins_no_map_and_the_first_view_keeps_waiting():
     one, first = starter(), frame(0, 0.0)
     assert one.offer(first, None) is None
     assert one.offer(frame(1, 0.1, 1e-4), None) is None
-    start = one.offer(frame(2, 0.2, 1.0), None)
+    start = offered_twice(one, frame(2, 0.2, 1.0))
     assert isinstance(start, TwoViewStart)
     assert start.first is first
 
 
-@pytest.mark.parametrize(("seconds", "together"), [(1.5, True), (1.501, False)])
+@pytest.mark.parametrize(("seconds", "together"), [(1.499, True), (1.501, False)])
 def test_a_view_that_has_waited_too_long_is_replaced(seconds, together):
     one, second = starter(), frame(1, seconds, 1.0)
     one.offer(frame(0, 0.0), None)
-    start = one.offer(second, None)
-    assert (start is not None) == together
-    if not together:
-        start = one.offer(frame(2, seconds + 0.1, 2.0), None)
-        assert isinstance(start, TwoViewStart)
-        assert start.first is second
+    if together:
+        assert offered_twice(one, second) is not None
+        return
+    assert one.offer(second, None) is None
+    start = offered_twice(one, frame(2, seconds + 0.1, 2.0))
+    assert isinstance(start, TwoViewStart)
+    assert start.first is second
 
 
 @pytest.mark.parametrize(("n_common", "together"), [(100, True), (99, False)])
@@ -97,14 +107,15 @@ def test_a_view_that_shows_too_little_of_the_first_one_replaces_it(n_common, tog
     strange = np.random.default_rng(1).integers(0, 256, (240 - n_common, 32), dtype=np.uint8)
     second.features.descriptors[:] = np.vstack([POINTS.descriptors[:n_common], strange])
     one.offer(frame(0, 0.0), None)
-    start = one.offer(second, None)
-    assert (start is not None) == together
-    if start is None:
-        third = frame(2, 0.2, 2.0)
-        third.features.descriptors[:] = second.features.descriptors
-        start = one.offer(third, None)
-        assert isinstance(start, TwoViewStart)
-        assert start.first is second
+    if together:
+        assert offered_twice(one, second) is not None
+        return
+    assert one.offer(second, None) is None
+    third = frame(2, 0.2, 2.0)
+    third.features.descriptors[:] = second.features.descriptors
+    start = offered_twice(one, third)
+    assert isinstance(start, TwoViewStart)
+    assert start.first is second
 
 
 def test_a_view_that_shows_too_little_of_the_first_one_and_too_little_at_all_is_not_kept():
@@ -118,8 +129,36 @@ def test_a_view_that_shows_too_little_of_the_first_one_and_too_little_at_all_is_
 def test_a_map_needs_enough_points_to_begin_with(min_landmarks, enough):
     one = starter(min_landmarks=min_landmarks)
     one.offer(frame(0, 0.0), None)
-    assert (one.offer(frame(1, 0.1, 1.0), None) is not None) == enough
+    assert (offered_twice(one, frame(1, 0.1, 1.0)) is not None) == enough
     assert one.is_waiting
+
+
+def test_a_pair_that_no_later_pair_confirms_begins_no_map():
+    """In the second view, far points seem to be near. The pair is consistent in itself."""
+    one, wrong = starter(), frame(1, 0.1, 1.0)
+    bent = POINTS.xyz * np.random.default_rng(3).uniform(0.1, 1.0, (240, 1))
+    in_second = transform(se3_exp(ASIDE), bent)
+    wrong.features.xy[:] = CAMERA.project(in_second)[:, :2]
+    assert one.offer(frame(0, 0.0), None) is None
+    assert one.offer(wrong, None) is None
+    assert one.offer(frame(2, 0.2, 1.0), None) is None  # it contradicts the first pair
+    start = one.offer(frame(3, 0.3, 1.1), None)
+    assert isinstance(start, TwoViewStart)
+    unit = np.median(start.points[:, 2]) / np.median(POINTS.xyz[start.features[0], 2])
+    np.testing.assert_allclose(start.points, unit * POINTS.xyz[start.features[0]], rtol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_camera_that_only_turns_begins_no_map(seed):
+    """Positions of features err by half a pixel."""
+    one, rng = starter(), np.random.default_rng(seed)
+    for k in range(8):
+        turned = frame_of(
+            POINTS.see(se3_exp(np.array([0, 0, 0, 0, 0.01 * k, 0.002 * k]))), k, 0.1 * k
+        )
+        turned.features.xy[:] += 0.5 * rng.standard_normal(turned.features.xy.shape)
+        turned.features.u_right[:] = np.nan
+        assert one.offer(turned, None) is None
 
 
 # -- the unit of a sub-map ------------------------------------------------------------------------

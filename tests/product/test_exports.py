@@ -352,7 +352,8 @@ def test_loops_and_gaps_of_a_run_become_edges(corridor_run, tmp_path):
 
 
 def test_the_picture_of_a_loop_shows_its_images_and_where_it_lies_in_the_map(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "tools"))
+    tools = Path(__file__).parents[2] / "tools"
+    monkeypatch.syspath_prepend(str(tools / "experiments" / "loops"))
     tool = importlib.import_module("loop_picture")
     loop = LoopEdge(6, 1, 0.5, True, "closed", T_query_match=np.eye(4))
     save_map(tmp_path / "map.npz", StoredMap(small_map(), CAMERA, (loop,)))

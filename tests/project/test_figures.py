@@ -7,7 +7,6 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -302,49 +301,3 @@ def test_the_command_checks(made, figures, monkeypatch, capsys):
     with pytest.raises(SystemExit) as ended:
         figures.main()
     assert ended.value.code == 1
-
-
-def test_a_benchmark_becomes_a_table_with_a_row_for_each_run(tmp_path, monkeypatch):
-    from vslam_lab.overview.schema import MEASURES, Drive, OverviewJson, RunEntry
-
-    def entry(town: int, ate: float | None) -> RunEntry:
-        measures = dict.fromkeys((name for name, *_ in MEASURES), 2.0) | {"ate_rmse_m": ate}
-        drive = Drive(dataset="synthetic", sequence="block", excerpt="", perturb="change:1")
-        return RunEntry(drive=drive, system="bow", seed=0, town=town, frames=279,
-                        measures=measures, source="", machine=None)  # fmt: skip
-
-    for name, runs in (("a", [entry(501, 0.01936)]), ("b", [entry(502, None)])):
-        report = OverviewJson(notes=[], systems=["bow"], rows=[], comparisons=[], runs=runs,
-                              versions={}, created=datetime(2026, 1, 1, tzinfo=UTC))  # fmt: skip
-        (tmp_path / f"{name}.json").write_text(report.to_json())
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    words = [str(tmp_path / "a.json"), str(tmp_path / "b.json"), "--out", str(tmp_path / "x.csv")]
-    monkeypatch.setattr(sys, "argv", ["run_table.py", *words])
-    importlib.import_module("run_table").main()
-    head, first, second = (tmp_path / "x.csv").read_text().splitlines()
-    assert head.startswith("dataset,sequence,excerpt,perturb,system,seed,town,alignment,frames,")
-    assert first.startswith("synthetic,block,,change:1,bow,0,501,se3,279,2,0.019,2.000,2.0000,")
-    assert second.startswith("synthetic,block,,change:1,bow,0,502,se3,279,2,,2.000,")
-
-
-def test_tables_of_runs_are_compared_pairwise_with_one_pair_for_each_sequence(
-    tmp_path, monkeypatch
-):
-    head = "dataset,sequence,excerpt,perturb,system,seed,alignment,frames,ate_rmse_m,rpe_m\n"
-    drives = range(6)
-    ours = [f"kitti,{k},,none,both,{s},se3,9,{k}.{s},1.0\n" for k in drives for s in (0, 1, 2, 9)]
-    theirs = [
-        f"kitti,{k},,none,orbslam3,{s},se3,9,{k}.{s + 3},1.0\n" for k in drives for s in (0, 1, 2)
-    ]
-    for name, rows in (("ours", ours), ("theirs", theirs)):
-        (tmp_path / f"{name}.csv").write_text(head + "".join(rows))
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    words = [str(tmp_path / f"{name}.csv") for name in ("ours", "theirs", "paired")]
-    monkeypatch.setattr(sys, "argv", ["paired_tests.py", *words[:2], "--out", words[2]])
-    importlib.import_module("paired_tests").main()
-    assert (tmp_path / "paired.csv").read_text().splitlines() == [
-        "first,second,perturb,measure,sequences,second_smaller,first_smaller,equal,"
-        "median_difference,p_value",
-        "both,orbslam3,none,ate_rmse_m,6,0,6,0,0.3000,0.031",
-        "both,orbslam3,none,rpe_m,6,0,0,6,0.0000,",
-    ]

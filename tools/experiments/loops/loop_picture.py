@@ -2,7 +2,7 @@
 
 The picture shows the two images of the loop with their matches, and the map from above.
 
-python tools/loop_picture.py RUN OUT.jpg
+python tools/experiments/loops/loop_picture.py RUN OUT.jpg
 """
 
 from __future__ import annotations

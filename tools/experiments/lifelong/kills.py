@@ -3,16 +3,17 @@
 ``kill -9`` ends a run after a random number of frames. Every other run is killed while an autosave
 is being written. Afterwards, all files of the run are read, and the run is resumed.
 
-The script prints for each run the frame at which it was killed, the number of saved frames, the
-seconds of work that were lost, and the ATE of the whole run. It also tells whether the trajectory
-is byte-identical to the trajectory of an undisturbed run.
+The table has for each run the frame at which it was killed, the number of saved frames, the seconds
+of work that were lost, the ATE of the whole run, and whether the trajectory is byte-identical to
+that of an undisturbed run. The last two are empty if nothing had been saved.
 
-    python tools/kill_test.py --kills 10 --autosave 1 -- --dataset synthetic --seq demo
+    python tools/experiments/lifelong/kills.py --out kills.csv -- --dataset synthetic --seq demo
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import random
@@ -26,7 +27,6 @@ from pathlib import Path
 from vslam.maps.storage import load_map
 from vslam.run.autosave import MAP, ONLINE, PROGRESS
 from vslam.run.progress import read_progress
-from vslam.support.errors import InputError
 from vslam.types.trajectory import read_trajectory
 
 RUN = (sys.executable, "-m", "vslam", "run")
@@ -90,41 +90,39 @@ def saved_frames(folder: Path) -> tuple[int, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=10)
-    parser.add_argument("--autosave", type=float, default=4.0)
+    parser.add_argument("--autosave", type=float, default=1.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("words", nargs="+", help="options of vslam run that name the images")
     options = parser.parse_args()
     random_ = random.Random(options.seed)
     words = [*options.words, "--autosave", str(options.autosave)]
+    rows: list[tuple[object, ...]] = []
     with tempfile.TemporaryDirectory() as name:
         out = Path(name)
         subprocess.run([*RUN, *options.words, *BRIEF, "--out", str(out / "whole")], check=True)
         whole = report_of(out / "whole" / "latest")
         undisturbed = trajectory_of(out / "whole" / "latest")
-        frames = int(whole["frames"])
-        print(f"undisturbed: {frames} frames, ATE {whole['ate_rmse_m']:.4f} m", flush=True)
-        print("kill\tduring\tframe\tsaved\tlost_s\tate_m\tframes\tsame", flush=True)
         for number in range(options.kills):
             saving = number % 2 == 1
-            at = random_.randrange(1, frames - 1)
+            at = random_.randrange(1, int(whole["frames"]) - 1)
             folder, done, seconds = kill_at(words, out / str(number), at, saving)
             if (folder / "report.json").exists():
                 print(f"run {number} ended before it could be killed", flush=True)
                 continue
-            try:
-                saved, wall_s = saved_frames(folder)
-            except InputError as error:
-                sys.exit(f"kill {number}: {error}")
-            row = (
-                f"{number}\t{'save' if saving else 'run'}\t{done}\t{saved}\t{seconds - wall_s:.1f}"
-            )
-            if saved == 0:
-                print(f"{row}\tnothing saved yet", flush=True)
-                continue
-            subprocess.run([*RUN, "--resume", str(folder), *BRIEF], check=True)
-            report, same = report_of(folder), trajectory_of(folder) == undisturbed
-            ate, frames_in_all = report["ate_rmse_m"], report["frames"]
-            print(f"{row}\t{ate:.4f}\t{frames_in_all}\t{'yes' if same else 'no'}", flush=True)
+            saved, wall_s = saved_frames(folder)
+            ate = same = ""
+            if saved:
+                subprocess.run([*RUN, "--resume", str(folder), *BRIEF], check=True)
+                ate = f"{report_of(folder)['ate_rmse_m']:.4f}"
+                same = "yes" if trajectory_of(folder) == undisturbed else "no"
+            during = "save" if saving else "run"
+            rows.append((number, during, done, saved, f"{seconds - wall_s:.1f}", ate, same))
+            print(*rows[-1], flush=True)
+    with options.out.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(["kill", "during", "frame", "saved", "lost_s", "ate_m", "same"])
+        table.writerows(rows)
 
 
 if __name__ == "__main__":

@@ -6,12 +6,9 @@ import csv
 import gc
 import json
 import re
-import runpy
-import sys
 import weakref
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -399,18 +396,3 @@ def test_cost_is_measured_in_a_process_of_its_own():
     assert set(found.query_ms) == {"1000", "5000"}
     assert min(found.query_ms.values()) > 0
     assert 50 < found.memory_mb < 2000
-
-
-def test_tests_of_images_are_compared_on_photographs(tmp_path, monkeypatch, capsys):
-    for place in range(4):
-        whole = texture(place, 480, 800)
-        folder = tmp_path / "landmarks" / str(place)
-        folder.mkdir(parents=True)
-        for k in range(2):
-            cv2.imwrite(str(folder / f"{k}.png"), whole[:, 40 * k : 640 + 40 * k])
-    script = Path(__file__).parents[2] / "tools/experiments/local_descriptors/image_test.py"
-    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path), "landmarks"])
-    runpy.run_path(str(script), run_name="__main__")
-    assert capsys.readouterr().out.splitlines()[2:] == [
-        f"| landmarks | {half} | 4 | 4, 4, 4 | 8 | 0, 0, 0 |" for half in ("tuning", "test")
-    ]

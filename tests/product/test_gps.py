@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import runpy
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -504,19 +502,3 @@ def test_fixes_before_a_stream_are_refused(corridor, tmp_path, fixes):
         require_overlap(early, source, fixes)
     with pytest.raises(InputError, match="cannot be used with a live camera"):
         require_overlap(good, replace(source, live=True), fixes)
-
-
-@pytest.mark.slow
-def test_the_experiment_prints_its_table(call, kitti_tree, tmp_path, monkeypatch, capsys):
-    code, _, err = call("run", "--data", kitti_tree, *WORDS, "--no-report")
-    assert code == 0, err
-    script = Path(__file__).parents[2] / "tools/experiments/gps/drive.py"
-    options = {"seeds": 1, "noise": 0.01, "walk": 0, "gaps": 0, "jumps": 0, "hertz": 10}
-    words = [f"--{name}={value}" for name, value in {**options, "sigma": 0.01}.items()]
-    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "runs" / "latest"), *words])
-    runpy.run_path(str(script), run_name="__main__")
-    *table, _, cost = capsys.readouterr().out.splitlines()
-    rows = [line.split(" | ") for line in table]
-    assert "s CPU for" in cost
-    assert [row[1] for row in rows[2:]] == ["vision alone", "fixes", "GPS alone", "with GPS"]
-    assert float(rows[-1][3]) < 0.1

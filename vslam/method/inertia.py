@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike
 from vslam.backend.inertial_filter import (
     FALL,
     TURN,
-    N,
     anchored,
     camera_covariance,
     camera_pose,
@@ -68,6 +67,7 @@ SIGMA_PX = 0.15
 SIGMA_M, SIGMA_RAD = 0.002, 0.0005
 SIGMA_PER_M = 0.005  # share of the distance between two frames, if that is larger than SIGMA_M
 POSE_INFLATION = 4.0
+_TURN_AND_FALL = np.ix_(*[np.r_[TURN, FALL]] * 2)
 REST_SIGMA = 0.01  # m/s, standard deviation of the velocity of a camera that stands still
 # A pose with a larger squared distance from its prediction is not used: 0.001 of six degrees of
 # freedom. After so many such poses in a row, the state is found anew.
@@ -286,10 +286,9 @@ def gravity_direction(state: InertialState, calibration: ImuCalibration) -> Grav
     R = state.T_world_imu[:3, :3]
     gravity = R.T @ state.gravity / GRAVITY
     A = np.concatenate([cross_matrix(gravity), R.T / GRAVITY], axis=1)  # by the errors of R and g
-    errors = [*range(N)[TURN], *range(N)[FALL]]
-    across = float(np.trace(A @ state.covariance[np.ix_(errors, errors)] @ A.T))
+    across = np.sum((A @ state.covariance[_TURN_AND_FALL]) * A)
     direction: Matrix = calibration.T_imu_camera[:3, :3].T @ gravity
-    return GravityDirection(direction, np.sqrt(across / 2.0))
+    return GravityDirection(direction, float(np.sqrt(across / 2.0)))
 
 
 def _noise(covariance: Matrix) -> Matrix:

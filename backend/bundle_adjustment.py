@@ -37,6 +37,8 @@ class BundleProblem:
         intrinsics: ``(6,)``, see ``Camera.intrinsics``.
         disparity_weight: ``(O,)`` float64, ratio of the standard deviation of u and v to the
             standard deviation of the disparity; None uses the ratio in ``intrinsics``.
+        gravity, gravity_sigma: ``(K, 3)`` and ``(K,)``, see ``PoseGraph``; None if gravity is
+            unknown. Only global bundle adjustment uses them.
     """
 
     T_cw: NDArray[np.float64]
@@ -48,6 +50,8 @@ class BundleProblem:
     inverse_sigma2: NDArray[np.float64]
     intrinsics: NDArray[np.float64]
     disparity_weight: NDArray[np.float64] | None = None
+    gravity: NDArray[np.float64] | None = None
+    gravity_sigma: NDArray[np.float64] | None = None
 
     def disparity_weights(self) -> NDArray[np.float64]:
         """Return ``(O,)`` float64: ``disparity_weight``, or the ratio in ``intrinsics`` if it is

@@ -9,13 +9,16 @@ this system. It is therefore stored as sparse 6x6 blocks and factorised by ``blo
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.backend.block_cholesky import analyse, factor_solve, panel
 from vslam.backend.bundle_adjustment import (
     BundleProblem,
     BundleSolution,
+    NormalEquations,
     Observations,
     empty_equations,
     invert_damped,
@@ -64,7 +67,8 @@ def adjust_globally(
     T_cw, points = problem.T_cw[cameras], problem.points[points_order]
     T_trial, points_trial = T_cw.copy(), points.copy()
     inlier = np.ones(n_observations, np.bool_)
-    cost = robust_cost(T_cw, points, observations, inlier)
+    level = _Level.of(problem, cameras)
+    cost = robust_cost(T_cw, points, observations, inlier) + level.cost(T_cw)
     equations = empty_equations(n_free, len(points), n_observations)
     S, x = np.empty(36 * len(structure.row)), np.empty((n_free, 6))
     V_inverse = np.empty((len(points), 3, 3))
@@ -72,7 +76,11 @@ def adjust_globally(
     for _ in range(iterations):
         if stop is not None and stop():
             break
+        cost -= level.cost(T_cw)
+        level = level.turned(T_cw)
+        cost += level.cost(T_cw)
         linearise(T_cw, n_free, points, observations, equations)
+        level.add_to(equations, T_cw)
         improved, small = False, False
         for _ in range(8):
             reduce_points_sparsely(
@@ -83,6 +91,7 @@ def adjust_globally(
                 step_points(n_free, observations, equations, step, V_inverse, points, points_trial)
                 step_cameras(n_free, step, T_cw, T_trial)
                 trial = robust_cost(T_trial, points_trial, observations, inlier)
+                trial += level.cost(T_trial)
                 if trial < cost:
                     small = cost - trial < tolerance * cost
                     cost = trial
@@ -100,6 +109,53 @@ def adjust_globally(
     inlier_unsorted = np.empty_like(inlier)
     inlier_unsorted[order] = inlier
     return BundleSolution(T_cw[rank], points_trial, cost, inlier_unsorted, done)
+
+
+@dataclass(frozen=True)
+class _Level:
+    """What cameras sense of gravity, as an error to be minimised.
+
+    Attributes:
+        down: ``(3,)`` direction of free fall in the world frame.
+        known: ``(M,)`` int64 cameras at which gravity is known.
+        gravity: ``(M, 3)`` direction of free fall in their frames.
+        information: ``(M,)`` inverse variances.
+    """
+
+    down: NDArray[np.float64]
+    known: NDArray[np.int64]
+    gravity: NDArray[np.float64]
+    information: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, problem: BundleProblem, cameras: NDArray[np.int64]) -> _Level:
+        """Take gravity from a problem, whose cameras are sorted."""
+        if problem.gravity is None or problem.gravity_sigma is None:
+            return cls(np.zeros(3), np.empty(0, np.int64), np.empty((0, 3)), np.empty(0))
+        sigma = problem.gravity_sigma[cameras]
+        known = np.flatnonzero(sigma > 0.0)
+        return cls(np.zeros(3), known, problem.gravity[cameras[known]], sigma[known] ** -2.0)
+
+    def turned(self, T_cw: NDArray[np.float64]) -> _Level:
+        """Choose the direction in the world that agrees best with the poses."""
+        if not len(self.known):
+            return self
+        R_cw = T_cw[self.known, :3, :3]
+        total = np.einsum("n,nji,nj->i", self.information, R_cw, self.gravity)
+        return replace(self, down=total / np.linalg.norm(total))
+
+    def cost(self, T_cw: NDArray[np.float64]) -> float:
+        error = T_cw[self.known, :3, :3] @ self.down - self.gravity
+        return 0.5 * float(self.information @ (error**2).sum(axis=1))
+
+    def add_to(self, equations: NormalEquations, T_cw: NDArray[np.float64]) -> None:
+        """Add the error to the normal equations of the cameras that are optimised."""
+        free = self.known < len(equations.U)
+        k, w = self.known[free], self.information[free, None]
+        found = T_cw[k, :3, :3] @ self.down
+        across = np.eye(3) - found[:, :, None] * found[:, None, :]
+        equations.U[k, 3:, 3:] += w[:, :, None] * across
+        equations.b[k, 3:] += w * np.cross(found, self.gravity[free])
 
 
 @kernel

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.bundle_adjustment import BundleProblem, BundleSolution
+from vslam.backend.gravity import gravity_at
 from vslam.backend.local_mapping import assemble
 from vslam.backend.loop_correction import carry_landmarks
 from vslam.support.kernels import kernel
@@ -51,7 +52,8 @@ def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
 
     The first keyframe of each connected part of the map is held fixed, because nothing else
     determines the position of this part. Two keyframes are connected if they observe a common
-    landmark.
+    landmark. In the part of the first keyframe, gravity has the same direction everywhere, where an
+    IMU has measured it.
     """
     living = map_.living_keyframes()
     landmarks = map_.living_landmarks().astype(np.int32)
@@ -63,6 +65,12 @@ def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
     n_revisits = len(map_.revisits)
     if n_revisits:
         problem, rows = _with_revisits(map_, problem, rows, landmarks)
+    gravity, sigma = gravity_at(map_, keyframes)
+    sigma[part[keyframes] != part[living[0]]] = 0.0  # other parts may have any attitude
+    if sigma.any():
+        unknown = np.zeros((n_revisits, 3))
+        gravity, sigma = np.concatenate([unknown, gravity]), np.r_[unknown[:, 0], sigma]
+        problem = replace(problem, gravity=gravity, gravity_sigma=sigma)
     return GlobalSnapshot(
         problem, keyframes, landmarks, rows, map_.n_keyframes, map_.n_landmarks, n_revisits
     )

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.backend.inertial_filter import DRIFT
+from vslam.backend.gravity import gravity_at
 from vslam.config import PoseGraphConfig
 from vslam.support.kernels import kernel
 from vslam.types.geometry import compose, inverse, inverses, se3_log
@@ -183,26 +183,9 @@ def essential_graph(
 
 
 def with_gravity(graph: PoseGraph, map_: Map) -> PoseGraph:
-    """Return a pose graph with what an IMU measured of gravity at the keyframes.
-
-    The errors of keyframes that follow each other soon are nearly equal, because the filter forgets
-    slowly: after the time in which the odometry tilts by one standard deviation. The variance of a
-    keyframe is multiplied by the number of keyframes within this time. [own]
-    """
-    direction, sigma = (
-        column[graph.keyframes] for column in (map_.keyframes.gravity, map_.keyframes.gravity_sigma)
-    )
-    known = np.flatnonzero(sigma > 0.0)
-    drive, seconds = map_.sessions[graph.keyframes[known]], map_.timestamps[graph.keyframes[known]]
-    reach = 0.5 * (sigma[known] / DRIFT) ** 2
-    alike = np.empty(len(known))
-    for one in np.unique(drive):
-        of_drive = drive == one
-        times, around = np.sort(seconds[of_drive]), reach[of_drive]
-        end = np.searchsorted(times, seconds[of_drive] + around, "right")
-        alike[of_drive] = end - np.searchsorted(times, seconds[of_drive] - around)
-    sigma[known] *= np.sqrt(alike)
-    return replace(graph, gravity=direction, gravity_sigma=sigma)
+    """Return a pose graph with what an IMU measured of gravity at the keyframes."""
+    gravity, sigma = gravity_at(map_, graph.keyframes)
+    return replace(graph, gravity=gravity, gravity_sigma=sigma)
 
 
 def connectivity(map_: Map) -> NDArray[np.int64]:

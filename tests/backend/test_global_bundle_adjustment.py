@@ -159,3 +159,53 @@ def test_all_cameras_held_moves_points_only():
     solution = adjust_globally(held, iterations=30, tolerance=1e-14)
     assert solution.T_cw.tobytes() == truth.tobytes()
     assert solution.cost < 1e-10
+
+
+def leaning(noise: float = 0.0, sigma: float = 0.004) -> tuple[BundleProblem, np.ndarray]:
+    """Make a problem whose right images lean: disparities tell that the world is bent. Each camera
+    also senses gravity."""
+    problem, truth = loop_problem(noise=0.1, mono=0.0, seed=2)
+    rng = np.random.default_rng(3)
+    lean = 0.4 * (problem.uvr[:, 1] - 120) / 120 * (problem.camera % 36 < 18)
+    gravity = truth[:, :3, :3] @ [0.0, 1.0, 0.0] + noise * rng.normal(size=(len(truth), 3))
+    gravity /= np.linalg.norm(gravity, axis=1)[:, None]
+    uvr = problem.uvr - np.stack([0 * lean, 0 * lean, lean], axis=1)
+    known = np.where(np.arange(len(truth)) % 5, sigma, 0.0)  # not at every fifth camera
+    return replace(problem, uvr=uvr, gravity=gravity, gravity_sigma=known), truth
+
+
+def unevenness(T_cw: np.ndarray, truth: np.ndarray) -> float:
+    """Return the RMS angle between the directions of gravity at the cameras, in the estimated
+    world, and their mean, in degrees."""
+    down = np.einsum("nji,nj->ni", T_cw[:, :3, :3], truth[:, :3, 1])
+    mean = down.mean(axis=0) / np.linalg.norm(down.mean(axis=0))
+    return float(np.degrees(np.sqrt(np.mean(np.arccos((down @ mean).clip(-1.0, 1.0)) ** 2))))
+
+
+def test_gravity_keeps_the_map_level():
+    problem, truth = leaning(noise=0.001, sigma=0.001)
+    without = replace(problem, gravity=None, gravity_sigma=None)
+    plain, level = (adjust_globally(one, iterations=40) for one in (without, problem))
+    assert unevenness(level.T_cw, truth) < 0.5 * unevenness(plain.T_cw, truth)
+    assert np.array_equal(level.T_cw[-1], problem.T_cw[-1])  # the world does not turn
+
+
+def test_the_optimum_with_gravity_is_that_of_gtsam():
+    problem, _ = leaning(noise=0.01)
+    ours = adjust_globally(problem, iterations=100, tolerance=1e-13)
+    known = np.flatnonzero(problem.gravity_sigma)
+    weights, R_cw = problem.gravity_sigma[known] ** -2.0, ours.T_cw[known, :3, :3]
+    down = np.einsum("n,nji,nj->i", weights, R_cw, problem.gravity[known])
+    graph, start = gtsam_graph(replace(problem, T_cw=ours.T_cw, points=ours.points))
+    for k in known.tolist():
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, problem.gravity_sigma[k])
+        measured = gtsam.Unit3(problem.gravity[k])
+        graph.add(gtsam.AttitudeFactorPose3(k, gtsam.Unit3(down), noise, measured))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-13)
+    result = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
+    n = len(problem.T_cw)
+    theirs = inverses(np.array([result.atPose3(k).matrix() for k in range(n)]))
+    assert pose_differences(ours.T_cw, theirs).max() < 1e-4
+    without = adjust_globally(replace(problem, gravity=None, gravity_sigma=None), iterations=100)
+    assert pose_differences(ours.T_cw, without.T_cw).max() > 1e-3

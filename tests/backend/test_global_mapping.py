@@ -68,6 +68,23 @@ def test_each_part_of_the_map_has_a_keyframe_held():
     assert snapshot.problem.n_free == 4
 
 
+def test_a_snapshot_knows_gravity_in_the_part_of_the_first_keyframe():
+    world = make_world(250)
+    for k in range(6):
+        world.add_keyframe(pose(k))
+    half = np.arange(125)
+    world.link_truth([0, 2, 3], chosen=half)
+    world.link_truth([1, 4, 5], chosen=half + 125)
+    assert take_snapshot(world.map, CAMERA).problem.gravity is None
+    table = world.map.keyframes
+    table.gravity[[1, 2, 3]] = np.eye(3)
+    table.gravity_sigma[[1, 2, 3]] = 0.01
+    snapshot = take_snapshot(world.map, CAMERA)
+    assert snapshot.keyframes.tolist() == [2, 3, 4, 5, 0, 1]
+    assert np.array_equal(snapshot.problem.gravity[:2], np.eye(3)[1:])
+    assert (snapshot.problem.gravity_sigma > 0).tolist() == [True, True, *[False] * 4]
+
+
 def test_adjusting_a_snapshot_repairs_the_map(check_map):
     world = world_of(6)
     a, rng = world.map.arrays, np.random.default_rng(0)

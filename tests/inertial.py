@@ -156,3 +156,20 @@ def seen_by(samples: np.ndarray, T_imu_camera: np.ndarray, flight: Flight) -> np
         force = samples[k, 4:] + np.cross(turning, arm) + np.cross(w, np.cross(w, arm))
         moved[k, 1:4], moved[k, 4:] = R @ w, R @ force
     return moved
+
+
+@dataclass(frozen=True)
+class SuddenTurn(Walk):
+    """A walk with a sudden turn about the vertical axis by ``angle`` rad, at the time ``at``."""
+
+    angle: float = 1.2
+    at: float = 1.5
+    seconds: float = 0.2
+
+    def _sines(self, t, order: int, which: int) -> np.ndarray:
+        waves = super()._sines(t, order, which)
+        if which == 0 or order > 1:
+            return waves
+        u = (np.asarray(t, float) - self.at) / self.seconds
+        turn = [1.0 + np.tanh(u), np.cosh(u) ** -2 / self.seconds][order]
+        return waves + 0.5 * self.angle * turn[..., None] * np.array([0.0, 1.0, 0.0])

@@ -65,6 +65,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.types.map", "vslam.types.frame_poses", "vslam.types.states"),
     ("vslam.types.map_view", "vslam.method.shared_map"),
     ("vslam.frontend", "vslam.backend", "vslam.loopclosure", "vslam.datasets", "vslam.maps"),
+    ("vslam.method.gyro",),
     ("vslam.method.hypotheses", "vslam.method.inertia"),
     ("vslam.method.starter", "vslam.method.closing", "vslam.method.motion"),
     ("vslam.method.map_frames", "vslam.method.gaps"),

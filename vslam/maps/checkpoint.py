@@ -14,7 +14,7 @@ from vslam.types.map import Map
 from vslam.types.states import Checkpoint, PublishedState
 from vslam.types.track import Track
 
-SCHEMA = 6
+SCHEMA = 7
 _MOST = 1e12  # metres, pixels or seconds
 LOOP_SHAPES = {
     "LoopEdge.T_query_match": (4, 4),
@@ -63,6 +63,7 @@ CHECKPOINTS = Codec(
         "Inertia.samples": ("N", 7),
         "Inertia.times": ("M",),
         "Inertia.poses": ("M", 4, 4),
+        "Inertia.gyro_bias": (3,),
         "InertialState.T_world_imu": (4, 4),
         "InertialState.velocity": (3,),
         "InertialState.gravity": (3,),

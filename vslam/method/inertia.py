@@ -33,6 +33,7 @@ from vslam.backend.inertial_filter import (
 )
 from vslam.backend.inertial_start import MAX_MISFIT, GravityState, PoseStretch, find_gravity
 from vslam.backend.preintegration import cross_matrix, preintegrate
+from vslam.method.gyro import LONGEST_GAP, with_known_bias
 from vslam.types.frame_poses import PoseRun
 from vslam.types.geometry import Matrix, inverse
 from vslam.types.imu import (
@@ -45,8 +46,6 @@ from vslam.types.imu import (
 )
 
 CARRIED_S = 3.0  # s without images after which a pose counts as lost, not as carried by the IMU
-# A gap between samples above which they do not tell the motion, in seconds.
-LONGEST_GAP = 0.1
 # The start needs poses over START_S seconds. It is tried again every RETRY_S seconds, with the
 # poses of the last STRETCH_S seconds, of which at most MOST_POSES are used. Of a slow camera, the
 # last FEWEST_POSES poses are used, if they are at most LONGEST_S seconds old.
@@ -300,7 +299,7 @@ def _noise(covariance: Matrix) -> Matrix:
 def _forgotten(inertia: Inertia) -> Inertia:
     """Return what is left if the state is unknown."""
     nothing = Inertia()
-    return replace(inertia, state=None, times=nothing.times, poses=nothing.poses)
+    return replace(with_known_bias(inertia), state=None, times=nothing.times, poses=nothing.poses)
 
 
 def _collected(inertia: Inertia, timestamp: float, T_odom_camera: Matrix) -> Inertia:

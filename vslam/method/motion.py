@@ -13,6 +13,7 @@ from vslam.frontend.motion_time import RECENT, motion_seconds
 from vslam.frontend.prediction import Prediction
 from vslam.frontend.standstill import has_come_to_rest, is_small
 from vslam.frontend.tracking import uncertainty_of
+from vslam.method.gyro import turn_by_gyro, with_turn
 from vslam.method.inertia import (
     CARRIED_S,
     KEPT_S,
@@ -22,6 +23,7 @@ from vslam.method.inertia import (
     found_scale,
     gravity_direction,
     in_metres,
+    is_refused,
     lost,
     predicted_covariance,
     predicted_motion,
@@ -83,9 +85,10 @@ class Motion:
         """Predict the pose of the next frame.
 
         If the state of the IMU is known, its samples give the motion since the last frame.
-        Otherwise, the camera is assumed to keep its velocity. The velocity is measured per second,
-        not per frame, so that dropped frames do not distort the prediction. Before the first frame
-        of a drive, the camera is expected at the reference keyframe.
+        Otherwise, the camera is assumed to keep its velocity, and turns as its gyroscope says. The
+        velocity is measured per second, not per frame, so that dropped frames do not distort the
+        prediction. Before the first frame of a drive, the camera is expected at the reference
+        keyframe.
 
         Args:
             timestamp: of the next frame, in seconds.
@@ -105,6 +108,8 @@ class Motion:
             T_odom_camera = self.state.odometry.T_odom_camera
             T_now_last = self._as_tracked(predicted_motion(inertial, T_odom_camera, self._imu))
             T_cw = orthonormalised(T_now_last @ self._frames.pose(-1))
+        elif self._imu is not None and last is not None:
+            T_cw = self._turned(T_cw, timestamp)
         return Prediction(
             len(self._frames),
             timestamp,
@@ -213,7 +218,13 @@ class Motion:
     ) -> Inertia:
         """Return what is known from the IMU after a tracked frame, to which the odometry moved."""
         inertia, inertial = self.state.inertia, predicted.inertial
-        if self._imu is None or not self.is_metric:
+        if self._imu is None:
+            return inertia
+        if inertia.state is None and not found_again:
+            before, T_odom_last = self._frames.timestamp(-1), self.state.odometry.T_odom_camera
+            R_now_last = odometry.T_odom_camera[:3, :3].T @ T_odom_last[:3, :3]
+            inertia = with_turn(inertia, before, track.timestamp, R_now_last, self._imu)
+        if not self.is_metric:
             return inertia
         T_odom_camera, local = odometry.T_odom_camera, odometry.now.local
         if found_again:
@@ -267,6 +278,21 @@ class Motion:
             imu.noise,
             LONGEST_GAP,
         )
+
+    def _turned(self, T_cw: Matrix, timestamp: float) -> Matrix:
+        """Return the predicted pose of the next frame with the rotation of the gyroscope. The
+        camera moves to the same position."""
+        inertia, before = self.state.inertia, self._frames.timestamp(-1)
+        if self._imu is None or is_refused(inertia):
+            return T_cw
+        turn = turn_by_gyro(inertia, before, timestamp, self._imu)
+        if turn is None:
+            return T_cw
+        T_now_last = np.eye(4)
+        T_now_last[:3, :3] = turn
+        T = self._as_tracked(T_now_last) @ self._frames.pose(-1)
+        T[:3, 3] = T[:3, :3] @ inverse(T_cw)[:3, 3] * -1.0
+        return orthonormalised(T)
 
     def _as_tracked(self, T_now_last: Matrix) -> Matrix:
         """Return a motion of the camera as it is mounted as a motion of the camera that is tracked,

@@ -237,6 +237,8 @@ class Inertia:
         disagreements: how often poses and samples did not agree.
         tried: time of the last start, in seconds.
         known_since: time since when gravity is known, in seconds; -1 if it never was.
+        gyro_bias: ``(3,)`` bias of the gyroscope in rad/s, as long as the state is unknown.
+        gyro_sigma: its standard deviation along each axis, in rad/s; -1 if it is unknown.
         scale_sigma: standard deviation of the logarithm of the scale of the map of one camera; -1
             if its unit is not known to be the metre. Unused for cameras that measure depth.
         metric_since: time since when this scale is known, in seconds; -1 if it never was.
@@ -251,6 +253,8 @@ class Inertia:
     disagreements: int = 0
     tried: float = -1.0
     known_since: float = -1.0
+    gyro_bias: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    gyro_sigma: float = -1.0
     scale_sigma: float = -1.0
     metric_since: float = -1.0
 

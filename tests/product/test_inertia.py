@@ -17,6 +17,7 @@ from vslam.method.inertia import (
     IMU_REFUSED,
     KEPT_S,
     gravity_direction,
+    lost,
     predicted_state,
     tracked,
     with_samples,
@@ -360,3 +361,21 @@ def test_what_is_seen_first_after_the_dark_joins_the_map_only_with_an_imu(imu):
     assert slam.in_map()[-1]
     assert results[-1].part == 0
     assert error(results[-1])[0] < 0.1
+
+
+@pytest.mark.parametrize("acceleration", [0.0, 0.5])
+def test_a_camera_that_stood_is_held_in_the_dark_until_its_samples_move_it(acceleration):
+    rest, calibration = Flight(3, speed=0.0, turning=0.0), ImuCalibration(np.eye(4), ADIS16448)
+    rows = rest.samples(np.arange(-0.1, 3.0, 0.005), BIAS, ADIS16448)
+    moving = rows[:, 0] > 1.0
+    rows[moving, 4:] += rest.rotation(0.0).T @ [acceleration, 0.0, 0.0]
+    times, pose = np.arange(0.0, 0.95, 0.05), rest.pose(0.0)
+    stretch = PoseStretch(times, np.tile(pose, (len(times), 1, 1)), 0.002, 0.0005)
+    found = find_gravity(stretch, rows, calibration, known_scale=True)
+    inertia = Inertia(samples=rows, state=found.state)
+    for t in np.arange(0.95, 2.01, 0.05):
+        predicted = predicted_state(inertia, t, calibration)
+        inertia = lost(inertia, predicted, 0.05, stood_still=True)
+    moved = np.linalg.norm(inertia.state.T_world_imu[:3, 3] - pose[:3, 3])
+    assert moved == pytest.approx(0.5 * acceleration, abs=0.03)
+    assert (inertia.carried_s == 0.0) == (acceleration == 0.0)

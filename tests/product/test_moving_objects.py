@@ -8,11 +8,13 @@ import cv2
 import numpy as np
 import pytest
 from conftest import corridor_mipmaps, render
+from inertial import ADIS16448
 
 from vslam.config import Config
 from vslam.slam import Slam
 from vslam.types.camera import Camera
 from vslam.types.features import TrackingState, TrackResult
+from vslam.types.imu import GRAVITY, ImuCalibration
 
 CAMERA = Camera(240.0, 240.0, 239.5, 99.5, 0.5, 480, 200)
 DISPARITY = 15  # of the vehicles, which are 8 m away
@@ -246,3 +248,26 @@ def test_a_run_that_is_resumed_at_a_standstill_gives_the_same_bytes(covered_driv
     follow(again, pairs, cut)
     again.finish()
     assert again.trajectory().T_wc.tobytes() == expected
+
+
+def test_an_imu_holds_a_standing_camera_before_a_lorry_that_stops_in_front_of_it(street):
+    """Images tell that the camera stands, and the samples that it goes on to stand."""
+    lorry = Vehicle(1.0, 40)
+    pairs = at_rest(street, lorry, 26)
+    covered = next(k for k in range(26) if lorry.covers(k) > 0.95)
+    pairs[covered + 1 :] = [noisy(lorry.before(street.rest, covered), k) for k in range(60)]
+    slam = Slam(CAMERA, Config(), "none", threads=1, imu=ImuCalibration(np.eye(4), ADIS16448))
+    results = []
+    for k, pair in enumerate(pairs):
+        times = 0.1 * k + np.arange(-0.095, 0.001, 0.005)
+        rows = np.column_stack([times, np.tile([0.0, 0.0, 0.0, 0.0, -GRAVITY, 0.0], (20, 1))])
+        rng = np.random.default_rng(k)
+        noise = np.repeat([ADIS16448.gyro, ADIS16448.accel], 3) / np.sqrt(0.005)
+        rows[:, 1:] += noise * rng.standard_normal((20, 6)) + [0.01, -0.02, 0.05, 0.05, -0.1, 0.08]
+        results.append(slam.step(*pair, 0.1 * k, imu=rows))
+    slam.finish()
+    moved = [np.linalg.norm(result.T_wc[:3, 3]) for result in results]
+    assert max(moved) < 0.02
+    lost = [result.state for result in results if result.state != TrackingState.OK]
+    assert len(lost) > 40  # 4 s, longer than an IMU may carry a camera that moves
+    assert set(lost) == {TrackingState.INERTIAL}

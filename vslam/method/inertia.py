@@ -32,7 +32,7 @@ from vslam.backend.inertial_filter import (
     moved,
 )
 from vslam.backend.inertial_start import MAX_MISFIT, GravityState, PoseStretch, find_gravity
-from vslam.backend.preintegration import cross_matrix, preintegrate
+from vslam.backend.preintegration import cross_matrix, preintegrate, so3_log
 from vslam.method.gyro import LONGEST_GAP, with_known_bias
 from vslam.types.frame_poses import PoseRun
 from vslam.types.geometry import Matrix, inverse
@@ -68,6 +68,9 @@ SIGMA_PER_M = 0.005  # share of the distance between two frames, if that is larg
 POSE_INFLATION = 4.0
 _TURN_AND_FALL = np.ix_(*[np.r_[TURN, FALL]] * 2)
 REST_SIGMA = 0.01  # m/s, standard deviation of the velocity of a camera that stands still
+# A camera that stood still has moved off if the samples of a frame show more than this, in m/s^2
+# and rad/s. A car gains 1 m/s^2.
+REST_ACCEL, REST_RATE = 0.1, 0.02
 # A pose with a larger squared distance from its prediction is not used: 0.001 of six degrees of
 # freedom. After so many such poses in a row, the state is found anew.
 IMPLAUSIBLE, MOST_REFUSED = 22.5, 5
@@ -196,15 +199,33 @@ def found_again(
     return replace(inertia, state=anchored(state, T_odom_imu), carried_s=0.0, refused=0)
 
 
-def lost(inertia: Inertia, predicted: InertialState | None, seconds: float) -> Inertia:
+def lost(
+    inertia: Inertia, predicted: InertialState | None, seconds: float, *, stood_still: bool
+) -> Inertia:
     """Return what is known after a frame that was not tracked.
+
+    A camera that stood still when it was last seen, and that the samples do not move, still stands.
+    Then nothing drifts, and the time does not count. Samples alone cannot tell rest from even
+    motion.
 
     Args:
         seconds: time since the frame before.
+        stood_still: whether the camera stood still in the last frame that was tracked.
     """
-    if predicted is None:
+    before = inertia.state
+    if predicted is None or before is None:
         return _forgotten(inertia)
+    if stood_still and _rests(before, predicted):
+        return replace(inertia, state=corrected_by_rest(predicted, REST_SIGMA).state)
     return replace(inertia, state=predicted, carried_s=inertia.carried_s + seconds)
+
+
+def _rests(before: InertialState, after: InertialState) -> bool:
+    """Return whether samples show neither acceleration nor rotation between two states."""
+    seconds = after.timestamp - before.timestamp
+    turn = so3_log(np.ascontiguousarray(before.T_world_imu[:3, :3].T @ after.T_world_imu[:3, :3]))
+    gained = np.linalg.norm(after.velocity - before.velocity)
+    return bool(gained < REST_ACCEL * seconds and np.linalg.norm(turn) < REST_RATE * seconds)
 
 
 def seeks_scale(inertia: Inertia) -> bool:

@@ -211,7 +211,9 @@ class Motion:
         inertia = self.state.inertia
         if self._imu is None or not len(self._frames):
             return inertia
-        return lost(inertia, predicted.inertial, track.timestamp - self._frames.timestamp(-1))
+        elapsed = track.timestamp - self._frames.timestamp(-1)
+        stood_still = predicted.last is not None and predicted.last.still is not None
+        return lost(inertia, predicted.inertial, elapsed, stood_still=stood_still)
 
     def _learned(
         self, track: Track, predicted: Prediction, odometry: OdometryState, *, found_again: bool

@@ -268,7 +268,20 @@ def some_progress() -> Progress:
     tracks = [
         TrackResult(0, 1.5, np.eye(4), TrackingState.OK, 9, 8, 7, 6, True, False, {"extract": 2.5}),
         TrackResult(1, 1.6, T, TrackingState.LOST, 5, 4, 3, 2, False, True, {"relocalise": 1.25}),
-        TrackResult(2, 1.7, T, TrackingState.OK, 0, 0, 0, 0, False),
+        TrackResult(
+            2,
+            1.7,
+            T,
+            TrackingState.OK,
+            0,
+            0,
+            0,
+            0,
+            False,
+            gravity=np.array([0.1, 9.8, 0.2]),
+            imu_bias=np.arange(6.0),
+            imu_bias_sigma=np.arange(6.0) / 10.0,
+        ),
         TrackResult(3, 1.8, T, TrackingState.DROPPED, 0, 0, 0, 0, False),
     ]
     log = TrackLog(TrackTable())
@@ -287,8 +300,11 @@ def test_progress_is_read_as_it_was_written(tmp_path):
     read = read_progress(tmp_path / PROGRESS)
     tracks = read.tracks.results()
     for was, now in zip(progress.tracks.results(), tracks, strict=True):
-        assert np.array_equal(was.T_wc, now.T_wc)
-        assert replace(was, T_wc=now.T_wc) == now
+        arrays = {"T_wc": now.T_wc}
+        arrays |= {name: getattr(now, name) for name in ("gravity", "imu_bias", "imu_bias_sigma")}
+        for name, array in arrays.items():
+            assert np.array_equal(getattr(was, name), array)
+        assert replace(was, **arrays) == now
     assert [track.stage_ms for track in tracks] == [{"extract": 2.5}, {"relocalise": 1.25}, {}, {}]
     assert [track.state for track in tracks] == ["OK", "LOST", "OK", "DROPPED"]
     assert (read.skipped, read.latency_ms) == (progress.skipped, progress.latency_ms)

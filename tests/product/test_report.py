@@ -7,6 +7,7 @@ import re
 from base64 import b64decode
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from vslam.config import Config, load_config
 from vslam.evaluation.loops import evaluate_loops
 from vslam.evaluation.trajectories import evaluate_trajectory, read_pair
+from vslam.method.inertia import IMU_REFUSED
 from vslam.report.folder import write_results
 from vslam.report.run_page import headlines
 from vslam.report.schema import DetectorFigures, ReportJson
@@ -26,9 +28,12 @@ from vslam.run.options import RunOptions
 from vslam.run.outcome import RunOutcome
 from vslam.types.camera import Camera
 from vslam.types.features import TrackingState, TrackResult
+from vslam.types.imu import ImuCalibration
 from vslam.types.loops import LoopCorrection, LoopEdge
+from vslam.types.odometry import PoseUncertainty
 from vslam.types.trajectory import Trajectory, read_trajectory, write_tum
 
+DOWN = np.array([0.0, 9.81, 0.0])
 FIGURES = {
     "top_view",
     "loop_closing",
@@ -51,6 +56,8 @@ class _Sequence:
     camera: Camera = CAMERA
     name: str = "00"
     world: str = ""
+    imu: object = None
+    imu_refused: str = ""
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -135,6 +142,27 @@ def make_outcome(
         n_keyframes=len(T_wc[::keyframe_every]),
         n_landmarks=60 * frames,
     )
+
+
+def carried(seconds: float = 0.5) -> RunOutcome:
+    """Make a run with an IMU that knew gravity after 1 s and carried two stretches."""
+    outcome = make_outcome(lost=slice(0, 0))
+    tracks, n = [], round(10 * seconds)
+    for track in outcome.tracks:
+        know = {}
+        if track.index >= 10:
+            bias = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
+            know = {"gravity": DOWN, "imu_bias": bias, "imu_bias_sigma": 0.1 * bias}
+        if 50 <= track.index < 50 + n or 90 <= track.index < 91:
+            know["state"] = TrackingState.INERTIAL
+        C = PoseUncertainty(np.diag([1e-4] * 3 + [1e-10] * 3), np.zeros((6, 6)), 0)
+        T = outcome.sequence.ground_truth[track.index].copy()
+        if "state" in know:
+            T[:3, 3] += 0.04
+        tracks.append(replace(track, T_odom_camera=T, uncertainty=C, **know))
+    imu = SimpleNamespace(calibration=ImuCalibration(np.eye(4), time_offset=0.004))
+    sequence = replace(outcome.sequence, imu=imu)
+    return replace(outcome, tracks=tracks, sequence=sequence, gravity=DOWN)
 
 
 def two_laps(frames: int = 500, *, keyframe_every: int = 4) -> RunOutcome:
@@ -775,3 +803,42 @@ def test_calibration_files_are_among_the_options(tmp_path):
     report = report_of(replace(outcome, settings=settings), tmp_path)
     assert report.calib == settings.calib
     assert "right.yaml" in (tmp_path / "report.md").read_text()
+
+
+def test_the_report_has_a_section_on_the_imu(tmp_path):
+    report = report_of(carried(), tmp_path)
+    found = report.imu
+    assert found.refused == ""
+    assert found.gravity_since_s == pytest.approx(1.0)
+    assert report.gravity == tuple(DOWN)
+    assert found.gyro_bias == (0.01, 0.02, 0.03)
+    assert found.accel_bias_sigma == pytest.approx((0.01, 0.02, 0.03))
+    assert report.inertial_frames == 6
+    assert report.lost_frames == 0
+    assert found.carried_s == pytest.approx(0.6)
+    assert found.longest_s == pytest.approx(0.5)
+    assert found.carried_error_m == pytest.approx(0.04 * np.sqrt(3.0))
+    assert found.carried_error_deg == pytest.approx(0.0, abs=1e-6)
+    # An error of 0.04 m along three axes, whose variances are those of both ends together.
+    assert found.carried_nees == pytest.approx(3 * 0.04**2 / 2e-4 / 6.0, rel=0.05)
+    text = (tmp_path / "report.md").read_text()
+    assert "since 1.00 s" in text
+    assert "6 frames, 0.60 s, the longest stretch 0.50 s" in text
+    assert "0.0100 ± 0.0010" in text
+    drawn = {path.stem for path in (tmp_path / "figures").iterdir()}
+    assert {"gyro_bias", "accel_bias"} <= drawn
+    assert not {"gyro_bias", "accel_bias"} & FIGURES
+
+
+def test_the_report_says_why_an_imu_was_not_used(tmp_path):
+    before = make_outcome()
+    assert summarize(before, None, None, None).imu is None
+    sequence = replace(before.sequence, imu_refused="imu.csv: the IMU is not used, because.")
+    report = report_of(replace(before, sequence=sequence), tmp_path)
+    assert report.imu.refused == "imu.csv: the IMU is not used, because."
+    text = (tmp_path / "report.md").read_text()
+    assert "## IMU\n\nimu.csv: the IMU is not used, because.\n" in text
+    assert "gravity known" not in text
+
+    during = replace(carried(), warnings=[IMU_REFUSED])
+    assert summarize(during, None, None, None).imu.refused == IMU_REFUSED

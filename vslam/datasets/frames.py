@@ -162,6 +162,7 @@ class Source(_Frames):
             For a stream, only the frames that have been read so far are counted. None if all frames
             have their recorded times.
         warnings: what the report of a run must say about the data, in sentences.
+        imu_refused: why a run does not use the IMU of the data, as a sentence; empty if it does.
         imu: the IMU on the camera; None if there is none. Its calibration refers to the left camera
             of ``camera``.
         calibration: calibration of the images before rectification; None if the reader finds them
@@ -177,6 +178,7 @@ class Source(_Frames):
     """
 
     camera: Camera
+    imu_refused: str = ""
     world: str = ""
     calibration: Calibration | None = None
     rectify_mask: Callable[[Image], Image] | None = None

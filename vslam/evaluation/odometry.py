@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.types.features import TrackResult
+from vslam.types.features import TrackingState, TrackResult
 from vslam.types.geometry import Matrix, inverse, orthonormalised, se3_log
-from vslam.types.odometry import relative_covariance
+from vslam.types.odometry import PoseUncertainty, relative_covariance
 from vslam.types.trajectory import Trajectory
 
 
@@ -62,26 +62,56 @@ def motion_errors(
         interval_s: least duration of a motion in seconds. Each motion ends at the first frame that
             is at least ``interval_s`` later than its first frame.
     """
-    true_pose = dict(zip(truth.timestamps.tolist(), truth.T_wc, strict=True))
-    usable = [
-        (track.index, track.timestamp, track.T_odom_camera, track.uncertainty)
+    usable = _usable(tracks, truth)
+    times = np.array([track.timestamp for track, _, _ in usable])
+    last = np.searchsorted(times, times + interval_s).tolist()
+    pairs = [(usable[i], usable[j]) for i, j in enumerate(last) if j < len(usable)]
+    return _errors(pairs, truth)
+
+
+def carried_errors(tracks: Sequence[TrackResult], truth: Trajectory) -> MotionErrors:
+    """Compare the motions through which an IMU has carried the camera with the true motions.
+
+    There is a motion for each frame in the state ``INERTIAL``. It begins at the last frame that was
+    tracked.
+
+    Args:
+        tracks, truth: as for ``motion_errors``.
+    """
+    pairs: list[tuple[_Pose, _Pose]] = []
+    before: _Pose | None = None
+    for pose in _usable(tracks, truth):
+        state = pose[0].state
+        if state != TrackingState.INERTIAL:
+            before = pose if state in (TrackingState.OK, TrackingState.WEAK) else None
+        elif before is not None:
+            pairs.append((before, pose))
+    return _errors(pairs, truth)
+
+
+_Pose = tuple[TrackResult, Matrix, PoseUncertainty]  # with ``T_odom_camera``
+
+
+def _usable(tracks: Sequence[TrackResult], truth: Trajectory) -> list[_Pose]:
+    known = set(truth.timestamps.tolist())
+    return [
+        (track, track.T_odom_camera, track.uncertainty)
         for track in tracks
-        if track.timestamp in true_pose
+        if track.timestamp in known
         and track.T_odom_camera is not None
         and track.uncertainty is not None
     ]
-    times = np.array([timestamp for _, timestamp, _, _ in usable])
+
+
+def _errors(pairs: Sequence[tuple[_Pose, _Pose]], truth: Trajectory) -> MotionErrors:
+    true_pose = dict(zip(truth.timestamps.tolist(), truth.T_wc, strict=True))
     first: list[int] = []
     xi: list[Matrix] = []
     covariance: list[Matrix] = []
-    for index, t_first, T_first, uncertainty_first in usable:
-        last = int(np.searchsorted(times, t_first + interval_s))
-        if last == len(usable):
-            break
-        _, t_last, T_last, uncertainty_last = usable[last]
+    for (one, T_first, uncertainty_first), (other, T_last, uncertainty_last) in pairs:
         T_last_first = inverse(T_last) @ T_first
-        T_true = inverse(true_pose[t_last]) @ true_pose[t_first]
-        first.append(index)
+        T_true = inverse(true_pose[other.timestamp]) @ true_pose[one.timestamp]
+        first.append(one.index)
         xi.append(se3_log(orthonormalised(T_true @ inverse(T_last_first))))
         covariance.append(relative_covariance(uncertainty_first, uncertainty_last, T_last_first))
     return MotionErrors(

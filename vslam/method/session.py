@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vslam.backend.inertial_filter import BIAS
 from vslam.config import changed_thresholds
 from vslam.frontend.images import Images
 from vslam.frontend.orb import level_shapes
@@ -330,6 +331,9 @@ class Session:
 
     def _result(self, track: Track, stage_ms: dict[str, float]) -> TrackResult:
         odometry = self._motion.state.odometry
+        inertial, bias, bias_sigma = self._motion.state.inertia.state, None, None
+        if inertial is not None:
+            bias, bias_sigma = inertial.bias, np.sqrt(np.diag(inertial.covariance)[BIAS])
         T_wc = self._context.camera.as_mounted(inverse(track.T_cw))
         return TrackResult(
             index=track.index,
@@ -351,6 +355,8 @@ class Session:
             gravity=None
             if track.gravity is None
             else GRAVITY * inverse(track.T_cw)[:3, :3] @ track.gravity.direction,
+            imu_bias=bias,
+            imu_bias_sigma=bias_sigma,
         )
 
     # The state of the drive

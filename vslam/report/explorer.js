@@ -21,7 +21,7 @@
   const most = (values) => values.reduce((a, b) => (b > a ? b : a), 0);  // NaN is not greater
   const greatest = most(error), mostInliers = Math.max(most(inliers), 1);
   const colour = (name) => getComputedStyle(box).getPropertyValue("--" + name).trim();
-  const ofState = { WEAK: "#f59e0b", LOST: "#ef4444", DROPPED: "#8b5cf6" };
+  const ofState = { WEAK: "#f59e0b", INERTIAL: "#06b6d4", LOST: "#ef4444", DROPPED: "#8b5cf6" };
   let now = 0, view = null, timer = null, wanted = false;
 
   const context = (canvas) => {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,15 +30,20 @@ from vslam.report.drawing import (
     draw,
     new_figure,
 )
-from vslam.report.summary import stage_names
+from vslam.report.summary import intervals, stage_names
 from vslam.report.trajectory_figures import gps_map, loop_closing, top_view
 from vslam.run.outcome import RunOutcome
-from vslam.types.features import TrackingState
+from vslam.types.features import TrackingState, TrackResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _STAGE_COLORS = [BLUE, AMBER, GREEN, VIOLET, "#ec4899", "#06b6d4", "#84cc16", "#f97316", GREY]
+_AXIS_COLORS = (BLUE, AMBER, GREEN)
+_BIASES = (
+    ("gyro_bias", "gyroscope", "rad/s", slice(0, 3)),
+    ("accel_bias", "accelerometer", "m/s²", slice(3, 6)),
+)
 _MOTION_S = 1.0  # duration of the motions whose errors are drawn
 _MAX_BINS = 240  # in the plot of stacked times; a bin is then one or two pixels wide
 
@@ -105,6 +110,14 @@ def _drawings(
             "matches.",
             _tracked_points(outcome),
         )
+    if any(track.imu_bias is not None for track in outcome.tracks):
+        for name, instrument, unit, part in _BIASES:
+            yield (
+                name,
+                f"Estimated bias of the {instrument} along its axes, and twice its standard "
+                "deviation. Shaded frames are carried by the IMU alone.",
+                _bias(outcome.tracks, f"Bias of the {instrument}", unit, part),
+            )
     if stage_names(outcome.tracks):
         yield (
             "stage_times",
@@ -182,17 +195,39 @@ def _tracked_points(outcome: RunOutcome) -> Figure:
         y = np.array(values)[shown]
         axes.plot(frame[shown], y, color=color, linewidth=width, marker=marker, label=label)
     for state, color in STATE_COLORS.items():
-        at = np.array([track.state == state for track in tracks])
-        for first, last in _intervals(at):
-            # Legends skip labels that begin with "_", so each state has one entry.
-            name = state.lower() if first == np.flatnonzero(at)[0] else "_again"
-            axes.axvspan(
-                frame[first] - 0.5, frame[last] + 0.5, color=color, alpha=0.3, lw=0, label=name
-            )
+        _shade(axes, tracks, state, color)
     axes.set_ylim(bottom=0)
     _frame_axis(axes, frame)
     add_legend(figure, axes)
     return figure
+
+
+def _bias(tracks: Sequence[TrackResult], title: str, unit: str, part: slice) -> Figure:
+    figure, axes = new_figure(title, "frame", unit, LOW)
+    known = [track for track in tracks if track.imu_bias is not None]
+    frame = np.array([track.index for track in known])
+    bias = np.array([track.imu_bias for track in known])[:, part]
+    sigma = np.array([track.imu_bias_sigma for track in known])[:, part]
+    for values, deviation, axis, color in zip(bias.T, sigma.T, "xyz", _AXIS_COLORS, strict=True):
+        low, high = values - 2.0 * deviation, values + 2.0 * deviation
+        axes.fill_between(frame, low, high, color=color, alpha=0.12, linewidth=0)
+        axes.plot(frame, values, color=color, linewidth=1.1, label=axis)
+    _shade(axes, tracks, TrackingState.INERTIAL, STATE_COLORS[TrackingState.INERTIAL])
+    _frame_axis(axes, np.array([track.index for track in tracks]))
+    add_legend(figure, axes)
+    return figure
+
+
+def _shade(axes: Axes, tracks: Sequence[TrackResult], state: TrackingState, color: str) -> None:
+    """Shade the frames with a tracking state."""
+    at = np.array([track.state == state for track in tracks])
+    frame = np.array([track.index for track in tracks])
+    for first, last in intervals(at):
+        # Legends skip labels that begin with "_", so each state has one entry.
+        name = state.lower() if first == np.flatnonzero(at)[0] else "_again"
+        axes.axvspan(
+            frame[first] - 0.5, frame[last] + 0.5, color=color, alpha=0.3, lw=0, label=name
+        )
 
 
 def _usable_features(outcome: RunOutcome) -> tuple[str, list[int]]:
@@ -254,10 +289,3 @@ def _frame_axis(axes: Axes, frame: NDArray[np.int64]) -> None:
 
 def _stage_colors(names: list[str]) -> list[str]:
     return [_STAGE_COLORS[i % len(_STAGE_COLORS)] for i in range(len(names))]
-
-
-def _intervals(at: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the ``(M, 2)`` first and last indices of the intervals in which an ``(N,)`` bool array
-    is True."""
-    steps = np.diff(np.concatenate([[False], at, [False]]).astype(np.int8))
-    return np.stack([np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1], axis=1)

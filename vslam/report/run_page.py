@@ -277,6 +277,7 @@ def run_page(
                 [Bullets(report.skipped_messages)],
                 folded=True,
             ),
+            _imu(report),
             _gps(report),
             *explorer,
             Section("", [*figures], wide=False),
@@ -297,6 +298,44 @@ def run_page(
             Section("Configuration", [Markup(f"<pre>{escape(config)}</pre>")], folded=True),
         ),
     )
+
+
+def _imu(report: ReportJson) -> Section:
+    if (found := report.imu) is None:
+        return Section("IMU", ())
+    rows = []
+    if found.gravity_since_s is not None and report.gravity is not None:
+        direction = ", ".join(f"{value:.2f}" for value in report.gravity)
+        sigma = _number(found.gravity_sigma_deg, "°")
+        rows += [
+            ("gravity known", f"since {found.gravity_since_s:.2f} s"),
+            ("gravity in the world", f"({direction}) m/s²; standard deviation {sigma}"),
+        ]
+    else:
+        rows.append(("gravity known", "never"))
+    if report.metric_since_s is not None:
+        rows.append(("scale known", f"since {report.metric_since_s:.2f} s"))
+    for name, unit, bias, sigmas in (
+        ("gyroscope bias", "rad/s", found.gyro_bias, found.gyro_bias_sigma),
+        ("accelerometer bias", "m/s²", found.accel_bias, found.accel_bias_sigma),
+    ):
+        if bias is not None and sigmas is not None:
+            values = ", ".join(f"{b:.4f} ± {s:.4f}" for b, s in zip(bias, sigmas, strict=True))
+            rows.append((name, f"{values} {unit}"))
+    rows.append(("time offset, as calibrated", f"{1e3 * found.time_offset_s:.1f} ms"))
+    carried = counted(report.inertial_frames, "frame")
+    if report.inertial_frames:
+        seconds = f"{found.carried_s:.2f} s, the longest stretch {found.longest_s:.2f} s"
+        carried += f", {seconds}"
+    rows.append(("carried by the IMU alone", carried))
+    if found.carried_nees is not None:
+        errors = f"{_number(found.carried_error_m, 'm')}, {_number(found.carried_error_deg, '°')}"
+        rows += [
+            ("largest error of a carried pose", errors),
+            ("NEES of carried poses", f"{found.carried_nees:.2f} (1 if the covariances are right)"),
+        ]
+    parts: list[Part] = [found.refused, Pairs(rows)]
+    return Section("IMU", parts[:1] if found.refused and found.gravity_since_s is None else parts)
 
 
 def _gps(report: ReportJson) -> Section:

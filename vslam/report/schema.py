@@ -219,6 +219,40 @@ class GpsFigures(Record):
     level: bool
 
 
+class ImuFigures(Record):
+    """What a run learnt from an IMU. Frames that it carried are counted in ``inertial_frames``.
+
+    - ``refused``: why the IMU was not used, or no longer, as a sentence. Empty if it was used.
+    - ``gravity_since_s``: time from the first frame until gravity was known. None if it never was.
+    - ``gravity_sigma_deg``: standard deviation of its direction at the last keyframe, along each
+      axis.
+    - ``gyro_bias``, ``accel_bias``: the biases at the end in rad/s and m/s^2, in the frame of the
+      IMU. None if they are unknown.
+    - ``gyro_bias_sigma``, ``accel_bias_sigma``: their standard deviations.
+    - ``time_offset_s``: offset of the clocks according to the calibration.
+    - ``carried_s``, ``longest_s``: seconds for which the IMU alone carried the camera, in total and
+      at a stretch.
+    - ``carried_error_m``, ``carried_error_deg``: the largest errors of carried poses, since the
+      camera was last tracked. None without ground truth, or if no frame was carried.
+    - ``carried_nees``: mean of the normalised estimation errors squared of these poses, divided by
+      their degrees of freedom. It is 1 if the covariances are right.
+    """
+
+    refused: str = ""
+    gravity_since_s: float | None = None
+    gravity_sigma_deg: float | None = None
+    gyro_bias: tuple[float, float, float] | None = None
+    gyro_bias_sigma: tuple[float, float, float] | None = None
+    accel_bias: tuple[float, float, float] | None = None
+    accel_bias_sigma: tuple[float, float, float] | None = None
+    time_offset_s: float = 0.0
+    carried_s: float = 0.0
+    longest_s: float = 0.0
+    carried_error_m: float | None = None
+    carried_error_deg: float | None = None
+    carried_nees: float | None = None
+
+
 class Machine(Record):
     """The machine of the run. ``cores`` is the number of cores that the process may use."""
 
@@ -298,6 +332,7 @@ class ReportJson(Measures, Document):
     detectors: tuple[DetectorFigures, ...] = ()
     in_map: MapFigures | None = None
     gps_track: GpsFigures | None = None
+    imu: ImuFigures | None = None
 
     dataset: str
     sequence: str

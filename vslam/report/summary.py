@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import takewhile
@@ -15,17 +16,20 @@ from numpy.typing import NDArray
 from vslam.config import changed_thresholds
 from vslam.evaluation.loops import LoopEvaluation, evaluate_loops
 from vslam.evaluation.map_alignment import error_in_map
+from vslam.evaluation.odometry import carried_errors
 from vslam.evaluation.trajectories import (
     Evaluation,
     ate_rmse,
     evaluate_trajectory,
     evaluation_warnings,
 )
+from vslam.method.inertia import IMU_REFUSED
 from vslam.method.version import METHOD_VERSION
 from vslam.report.schema import (
     DetectorFigures,
     GapEntry,
     GpsFigures,
+    ImuFigures,
     LoopEntry,
     Machine,
     MapFigures,
@@ -106,6 +110,7 @@ def summarize(
         detectors=_detectors(outcome, evaluation, verdict),
         in_map=_figures_in_map(outcome),
         gps_track=gps_figures(outcome),
+        imu=_imu_figures(outcome),
         machine=this_machine(),
         versions=versions() | {"method": str(METHOD_VERSION)},
         created=datetime.now(UTC).replace(microsecond=0),
@@ -252,6 +257,63 @@ def gps_figures(outcome: RunOutcome) -> GpsFigures | None:
         ate_rmse_m=ate,
         level=track.anchored.level,
     )
+
+
+def _imu_figures(outcome: RunOutcome) -> ImuFigures | None:
+    source, tracks = outcome.sequence, outcome.tracks
+    refused = IMU_REFUSED if IMU_REFUSED in outcome.warnings else source.imu_refused
+    if source.imu is None and not refused:
+        return None
+    calibration = None if source.imu is None else source.imu.calibration
+    known = [track for track in tracks if track.gravity is not None]
+    carried = carried_seconds(tracks)
+    figures = ImuFigures(
+        refused=refused,
+        gravity_since_s=known[0].timestamp - tracks[0].timestamp if known else None,
+        gravity_sigma_deg=_gravity_sigma_deg(outcome),
+        time_offset_s=0.0 if calibration is None else calibration.time_offset,
+        carried_s=sum(carried),
+        longest_s=max(carried, default=0.0),
+    )
+    if known and known[-1].imu_bias is not None and known[-1].imu_bias_sigma is not None:
+        bias, sigma = known[-1].imu_bias.tolist(), known[-1].imu_bias_sigma.tolist()
+        found = {"gyro_bias": tuple(bias[:3]), "gyro_bias_sigma": tuple(sigma[:3])}
+        found |= {"accel_bias": tuple(bias[3:]), "accel_bias_sigma": tuple(sigma[3:])}
+        figures = figures.model_copy(update=found)
+    if outcome.ground_truth is None:
+        return figures
+    errors = carried_errors(tracks, outcome.ground_truth)
+    if not len(errors.first):
+        return figures
+    of_carried = {
+        "carried_error_m": float(errors.distance.max()),
+        "carried_error_deg": float(np.degrees(np.linalg.norm(errors.xi[:, 3:], axis=1).max())),
+        "carried_nees": float(errors.nees.mean()),
+    }
+    return figures.model_copy(update=of_carried)
+
+
+def _gravity_sigma_deg(outcome: RunOutcome) -> float | None:
+    if outcome.map is None:
+        return None
+    sigma = outcome.map.keyframes.gravity_sigma[outcome.map.living_keyframes()]
+    known = np.flatnonzero(sigma > 0.0)
+    return float(np.degrees(sigma[known[-1]])) if len(known) else None
+
+
+def carried_seconds(tracks: Sequence[TrackResult]) -> list[float]:
+    """Return the duration of each stretch through which the IMU alone carried the camera, from the
+    last frame before it to its last frame."""
+    carried = np.array([track.state == TrackingState.INERTIAL for track in tracks])
+    times = np.array([track.timestamp for track in tracks])
+    return [float(times[last] - times[max(first - 1, 0)]) for first, last in intervals(carried)]
+
+
+def intervals(at: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the ``(M, 2)`` first and last indices of the intervals in which an ``(N,)`` bool array
+    is True."""
+    steps = np.diff(np.concatenate([[False], at, [False]]).astype(np.int8))
+    return np.stack([np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1], axis=1)
 
 
 def stage_names(tracks: list[TrackResult]) -> list[str]:

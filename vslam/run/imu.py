@@ -17,7 +17,8 @@ _COVERED = 0.5  # share of the frames that must lie between the first and the la
 def with_usable_imu(source: Source) -> Source:
     """Return a source without an IMU that would harm, and with warnings that say why."""
     imu, notes = usable_imu(source)
-    return replace(source, imu=imu, warnings=(*source.warnings, *notes))
+    refused = notes[0] if imu is None and notes else ""
+    return replace(source, imu=imu, imu_refused=refused, warnings=(*source.warnings, *notes))
 
 
 def usable_imu(source: Source) -> tuple[Imu | None, list[str]]:

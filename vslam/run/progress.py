@@ -24,9 +24,10 @@ from vslam.types.features import TrackingState, TrackResult
 from vslam.types.loops import LoopCorrection, LoopEdge
 from vslam.types.odometry import N_NUMBERS, PoseUncertainty
 
-SCHEMA = 7
+SCHEMA = 8
 _STATES = tuple(TrackingState)
-_POSE, _NUMBERS = 16, 8 + 16 + N_NUMBERS  # columns of the pose, and of the numbers after it
+_POSE, _IMU = 16, 15  # columns of the pose, and of what is known from an IMU
+_NUMBERS = 8 + 16 + N_NUMBERS + _IMU  # columns after the pose
 _UNKNOWN = np.full(N_NUMBERS, np.nan)
 PROGRESS = Codec(
     LOOP_SHAPES
@@ -45,11 +46,12 @@ class TrackTable:
     """Tracking results of N frames, in order.
 
     Attributes:
-        rows: ``(N, 110)`` float64, one row for each frame: ``T_wc`` row by row, the timestamp, the
+        rows: ``(N, 125)`` float64, one row for each frame: ``T_wc`` row by row, the timestamp, the
             state, the numbers of features, stereo features, matches and inliers, the support, a sum
             (1 for a keyframe, 2 for a relocalised frame, 4 if the camera stands still, and 8 times
             the part), ``T_odom_camera`` row by
-            row, and ``PoseUncertainty.numbers``. Unknown numbers are NaN.
+            row, ``PoseUncertainty.numbers``, gravity, the biases of the IMU and their standard
+            deviations. Unknown numbers are NaN.
         stages: names of the timed stages.
         stage_ms: ``(N, S)`` float64 milliseconds. NaN for a stage that a frame skipped.
     """
@@ -101,6 +103,8 @@ class TrackLog:
         T_odom, uncertainty = track.T_odom_camera, track.uncertainty
         self._rows.extend(np.full(16, np.nan) if T_odom is None else T_odom.ravel())
         self._rows.extend(_UNKNOWN if uncertainty is None else uncertainty.numbers())
+        for value, n in ((track.gravity, 3), (track.imu_bias, 6), (track.imu_bias_sigma, 6)):
+            self._rows.extend([math.nan] * n if value is None else value)
         for name in track.stage_ms:
             if name not in self._stage_ms:
                 self._stage_ms[name] = array("d", [np.nan] * self._n)
@@ -226,8 +230,10 @@ def read_progress(path: Path) -> Progress:
 
 
 def _track(index: int, row: NDArray[np.float64], stage_ms: dict[str, float]) -> TrackResult:
-    timestamp, state, *counts, support, flags = row[_POSE : -16 - N_NUMBERS].tolist()
-    T_odom, numbers = row[-16 - N_NUMBERS : -N_NUMBERS].reshape(4, 4), row[-N_NUMBERS:]
+    basic, T_odom, numbers, gravity, bias, bias_sigma = np.split(
+        row[_POSE:], np.cumsum([8, 16, N_NUMBERS, 3, 6])
+    )
+    timestamp, state, *counts, support, flags = basic.tolist()
     n_features, n_stereo, n_matches, n_inliers = map(int, counts)
     return TrackResult(
         index=index,
@@ -244,6 +250,13 @@ def _track(index: int, row: NDArray[np.float64], stage_ms: dict[str, float]) -> 
         support=support if math.isfinite(support) else None,
         stands_still=bool(int(flags) & 4),
         stage_ms={name: ms for name, ms in stage_ms.items() if np.isfinite(ms)},
-        T_odom_camera=T_odom if np.isfinite(T_odom).all() else None,
+        T_odom_camera=_known(T_odom.reshape(4, 4)),
         uncertainty=PoseUncertainty.of_numbers(numbers) if np.isfinite(numbers).all() else None,
+        gravity=_known(gravity),
+        imu_bias=_known(bias),
+        imu_bias_sigma=_known(bias_sigma),
     )
+
+
+def _known(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    return values if np.isfinite(values).all() else None

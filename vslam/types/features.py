@@ -324,6 +324,9 @@ class TrackResult:
         stands_still: whether the camera stands still.
         gravity: ``(3,)`` acceleration of free fall in the world frame, in m/s^2. None without an
             IMU, and until it is known. The world frame itself is never turned.
+        imu_bias: ``(6,)`` biases of the gyroscope in rad/s and of the accelerometer in m/s^2, along
+            the axes of the IMU. None while gravity is unknown.
+        imu_bias_sigma: ``(6,)`` standard deviations of these biases.
         next_extraction: index of a later frame whose features will probably be needed, so that they
             can be extracted in advance. -1 if there is no such frame.
     """
@@ -345,6 +348,8 @@ class TrackResult:
     support: float | None = None
     stands_still: bool = False
     gravity: NDArray[np.float64] | None = None
+    imu_bias: NDArray[np.float64] | None = None
+    imu_bias_sigma: NDArray[np.float64] | None = None
     next_extraction: int = -1
 
     @property

@@ -126,8 +126,8 @@ def test_the_process_works_while_images_are_rendered_and_is_started_once(
 ):
     trace = python_is(monkeypatch, tmp_path, "exec sleep 600")
     with Compilation() as kernels:
-        for _ in range(2):  # called for each image
-            kernels.start()
+        kernels.start()
+        kernels.start()
         while not trace.exists() or not trace.read_text():
             time.sleep(0.01)
     assert_ended(trace)

@@ -135,7 +135,8 @@ def _open(
     from vslam.datasets.perturbation import parse_perturbation
 
     perturbation = parse_perturbation(options.perturb, options.seed)
-    source = open_given(options, console, kernels.start)
+    kernels.start()  # a town may have to be rendered
+    source = open_given(options, console)
     perturbation.bound_to(source)
     if source.imu is not None:
         source = replace(source, imu=perturbation.of_imu(source.imu))

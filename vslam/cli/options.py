@@ -296,20 +296,13 @@ def read_thresholds(given: str | None) -> Config:
     return as_config(thresholds, where)
 
 
-def open_given(
-    options: SourceOptions, console: Console, meanwhile: Callable[[], None] = lambda: None
-) -> Source:
+def open_given(options: SourceOptions, console: Console) -> Source:
     """Open the source that the options describe. If a synthetic town must be rendered first, the
-    progress is shown, and ``meanwhile`` is called after each frame."""
+    progress is shown."""
     from vslam.datasets.sources import open_source
 
     require_data(options)
-    with console.render_bar() as show:
-
-        def on_render(done: int, total: int) -> None:
-            meanwhile()
-            show(done, total)
-
+    with console.render_bar() as on_render:
         return open_source(options, on_render)
 
 

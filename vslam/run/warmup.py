@@ -30,7 +30,6 @@ class Compilation:
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
-        self._started = False
 
     def __enter__(self) -> Compilation:
         return self
@@ -41,12 +40,10 @@ class Compilation:
             self._process.wait()
 
     def start(self) -> None:
-        """Start the process if kernels are missing in the cache. Later calls do nothing."""
-        if self._started:
-            return
-        self._started = True
+        """Start the process if kernels are missing in the cache. A second call does nothing."""
         # The executable of a frozen application is not Python.
-        if sys.executable and not getattr(sys, "frozen", False) and is_cold():
+        here = sys.executable and not getattr(sys, "frozen", False)
+        if self._process is None and here and is_cold():
             # -P: do not import a folder "vslam" in the current directory.
             command = [sys.executable, "-P", "-m", "vslam.run.toy_room"]
             quiet = subprocess.DEVNULL

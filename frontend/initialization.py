@@ -81,6 +81,24 @@ class TwoViewModel:
     homography_share: float
 
 
+@dataclass(frozen=True, eq=False)
+class KnownTurn:
+    """The rotation between two views, as a gyroscope measured it.
+
+    Attributes:
+        R_2_1: ``(3, 3)``, maps directions of view 1 to view 2.
+        tolerance: largest error of the rotation, in radians.
+    """
+
+    R_2_1: Matrix
+    tolerance: float
+
+    def allows(self, T_2_1: Matrix) -> bool:
+        """Return whether a ``(4, 4)`` motion has this rotation."""
+        cosine = 0.5 * (np.trace(self.R_2_1.T @ T_2_1[:3, :3]) - 1.0)
+        return bool(cosine >= np.cos(self.tolerance))
+
+
 @dataclass(frozen=True)
 class TwoViews:
     """The relative pose of two views and the points that were triangulated from them.
@@ -137,13 +155,19 @@ def reconstruct(
     config: InitializationConfig,
     *,
     seed: int,
+    turn: KnownTurn | None = None,
 ) -> TwoViews | None:
     """Reconstruct the relative pose of two views and the matched points. Returns None if the
     matches do not determine the motion.
 
+    The matches of a plane, such as the ground, allow two motions, which usually differ in their
+    rotation. The rotation of a gyroscope then tells which one it was.
+
     Args:
         xy_1, xy_2: ``(N, 2)`` matched pixels.
         sigma: ``(N,)`` standard deviation of these positions, pixels.
+        turn: the rotation between the views; None if it is unknown. It is not used if no motion
+            with this rotation explains about as many points as the best motion.
     """
     if len(xy_1) < SAMPLE:
         return None
@@ -158,6 +182,10 @@ def reconstruct(
         return None
     views = [_triangulate(T, xy_1[match], xy_2[match], sigma[match], camera) for T in motions]
     counts = np.array([np.count_nonzero(good) for _, good, _ in views])
+    if turn is not None:
+        allowed = np.array([turn.allows(T) for T in motions])
+        if counts[allowed].max(initial=0) > _MAX_RIVAL_SHARE * counts.max():
+            counts[~allowed] = 0
     best = int(np.argmax(counts))
     rival = int(np.sort(counts)[-2])
     points, good, cosine = views[best]

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from conftest import corridor_mipmaps, render
-from inertial import ADIS16448, Flight, SuddenTurn, seen_by
+from inertial import ADIS16448, Flight, SuddenTurn, Walk, seen_by
 
 from vslam.method.gyro import turn_by_gyro, with_turn
 from vslam.slam import Slam
@@ -77,6 +77,39 @@ def test_the_gyroscope_makes_nothing_worse(name):
     alone, with_imu = errors_of("none"), errors_of(name)
     assert with_imu[0] < alone[0] + 0.5
     assert with_imu[1] < alone[1] + 0.5
+
+
+@cache
+def started(name: str) -> tuple[int, float]:
+    """Return the frame at which a map began that shows mostly a plane, and the error of the
+    direction of its first motion, in degrees."""
+    flight, mipmaps = Walk(3, speed=0.15, turning=0.35), corridor_mipmaps()
+    imu = {"none": None, "sound": CALIBRATION, "inverted": INVERTED}[name]
+    rows = seen_by(flight.samples(np.arange(-0.05, 3.0, 0.005)), T_IMU_CAMERA, flight)
+    rows[:, 1:] += BIAS
+    slam = Slam(CAMERA, imu=imu, detector="none", threads=1)
+    for k in range(50):
+        new = rows[(rows[:, 0] > 0.05 * (k - 1)) & (rows[:, 0] <= 0.05 * k)]
+        result = slam.step(render(mipmaps, CAMERA, flight.pose(0.05 * k)), None, 0.05 * k, imu=new)
+        if result.state == TrackingState.OK:
+            break
+    slam.finish()
+    first, second = (0.05 * slam.map.frames[i] for i in range(2))
+    moved = inverse(flight.pose(first)) @ flight.pose(second)
+    T = slam.map.keyframe_pose(0) @ inverse(slam.map.keyframe_pose(1))
+    cosine = T[:3, 3] @ moved[:3, 3] / np.linalg.norm(T[:3, 3]) / np.linalg.norm(moved[:3, 3])
+    return k, float(np.degrees(np.arccos(cosine)))
+
+
+def test_the_gyroscope_tells_which_motion_a_plane_has_seen():
+    frame, error = started("sound")
+    assert frame < 10
+    assert error < 20.0  # the other motion is 90 degrees off
+    assert started("none")[0] > 20
+
+
+def test_a_wrong_gyroscope_begins_no_wrong_map():
+    assert started("inverted")[1] < 20.0
 
 
 def learned(flight, calibration, n=10) -> Inertia:

@@ -13,6 +13,7 @@ import numpy as np
 
 from vslam.backend.inertial_start import GYRO_BIAS
 from vslam.backend.preintegration import Preintegration, preintegrate, so3_log
+from vslam.frontend.initialization import KnownTurn
 from vslam.types.geometry import Matrix
 from vslam.types.imu import ImuCalibration, Inertia
 
@@ -25,6 +26,7 @@ _CONTRADICTION = 16.3  # chi-square of three degrees of freedom, 0.001
 # The gyroscope is used if the standard deviation of the bias is at most this one, in rad/s, which
 # takes five frames, and lets the rotation err by at most 0.5 degrees.
 _CERTAIN, _MOST_RAD = 0.012, np.radians(0.5)
+_LEAST_TOLERANCE = 0.01  # rad, of the rotation of a motion that two views gave
 _LEAST = 0.005  # rad/s: the bias is never considered more certain
 
 
@@ -46,6 +48,23 @@ def turn_by_gyro(
     R = calibration.T_imu_camera[:3, :3]
     turn: Matrix = R.T @ motion.rotation.T @ R
     return turn
+
+
+def turn_of_start(
+    inertia: Inertia, start: float, end: float, calibration: ImuCalibration
+) -> KnownTurn | None:
+    """Return the rotation of the camera between the first two views of a map, also if the bias is
+    not known yet. None if samples are missing.
+
+    Args:
+        start, end: seconds.
+    """
+    motion = _motion(inertia, start, end, calibration)
+    if motion is None:
+        return None
+    R = calibration.T_imu_camera[:3, :3]
+    sigma = GYRO_BIAS if inertia.gyro_sigma < 0.0 else 3.0 * inertia.gyro_sigma
+    return KnownTurn(R.T @ motion.rotation.T @ R, _LEAST_TOLERANCE + sigma * (end - start))
 
 
 def with_turn(

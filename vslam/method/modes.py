@@ -13,7 +13,7 @@ from vslam.frontend.prediction import Prediction
 from vslam.frontend.tracker import Tracker
 from vslam.method.mapping import Mapper
 from vslam.method.published_map import PublishedMap
-from vslam.method.starter import Starter
+from vslam.method.starter import Starter, TurnBetween
 from vslam.types.camera import Image
 from vslam.types.context import Context
 from vslam.types.geometry import inverse, orthonormalised, se3_log
@@ -115,12 +115,14 @@ class Building:
         mapper: Mapper,
         tracker: Tracker,
         state: PolicyState | None = None,
+        turn_between: TurnBetween | None = None,
     ) -> None:
         """
         Args:
             state: the state of the keyframe policy in a checkpoint; None at the start of a drive.
+            turn_between: see ``Starter``.
         """
-        self.starter = Starter(context)
+        self.starter = Starter(context, turn_between)
         self.policy = KeyframePolicy(context, state)
         self._camera = context.camera
         self._config = context.config

@@ -9,11 +9,12 @@ from numpy.typing import ArrayLike
 
 from vslam.backend.inertial_filter import FALL_AND_BIAS, camera_pose
 from vslam.backend.inertial_start import GravityState
+from vslam.frontend.initialization import KnownTurn
 from vslam.frontend.motion_time import RECENT, motion_seconds
 from vslam.frontend.prediction import Prediction
 from vslam.frontend.standstill import has_come_to_rest, is_small
 from vslam.frontend.tracking import uncertainty_of
-from vslam.method.gyro import turn_by_gyro, with_turn
+from vslam.method.gyro import turn_by_gyro, turn_of_start, with_turn
 from vslam.method.inertia import (
     CARRIED_S,
     KEPT_S,
@@ -280,6 +281,18 @@ class Motion:
             imu.noise,
             LONGEST_GAP,
         )
+
+    def turn_between(self, start: float, end: float) -> KnownTurn | None:
+        """Return the rotation of the camera between two times, in seconds, as the gyroscope
+        measured it; None if it is unknown."""
+        inertia = self.state.inertia
+        if self._imu is None or is_refused(inertia):
+            return None
+        turn = turn_of_start(inertia, start, end, self._imu)
+        if turn is None or not self._context.camera.quarter_turns:
+            return turn
+        R = self._context.camera.T_mounted_camera[:3, :3]
+        return replace(turn, R_2_1=R.T @ turn.R_2_1 @ R)
 
     def _turned(self, T_cw: Matrix, timestamp: float) -> Matrix:
         """Return the predicted pose of the next frame with the rotation of the gyroscope. The

@@ -174,7 +174,9 @@ class Session:
         self._tracker = tracker = Tracker(context)
         self._mode: Mode = Localising(published)
         if not localize:
-            self._mode = Building(context, mapper, tracker, state.policy if state else None)
+            turn_between = None if imu is None else self._motion.turn_between
+            policy = state.policy if state else None
+            self._mode = Building(context, mapper, tracker, policy, turn_between)
         if state is None and opened.frames is not None and len(opened.frames.timestamp):
             self._continue_from_poses(opened.frames)
 

@@ -6,13 +6,14 @@ frames. The first frame is kept until a later frame forms a pair with it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.two_views import adjust_two_views
-from vslam.frontend.initialization import match_views, reconstruct
+from vslam.frontend.initialization import KnownTurn, match_views, reconstruct
 from vslam.types.camera import Image
 from vslam.types.context import Context
 from vslam.types.geometry import Matrix, se3_log
@@ -22,6 +23,8 @@ from vslam.types.track import Track
 # differ by at most this factor in the median, as a natural logarithm. In rendered halls, rooms and
 # towns, it was at most 0.24 for pairs whose translations are wrong by less than 8 degrees. [own]
 _MIN_COMMON, _MAX_SPREAD = 30, 0.3
+
+TurnBetween = Callable[[float, float], KnownTurn | None]
 
 
 @dataclass(frozen=True)
@@ -90,8 +93,17 @@ class Starter:
     only if two later frames form a pair with the first one, and both pairs give the same scene.
     """
 
-    def __init__(self, context: Context) -> None:
-        self._context = context
+    def __init__(
+        self,
+        context: Context,
+        turn_between: TurnBetween | None = None,
+    ) -> None:
+        """
+        Args:
+            turn_between: returns the rotation of the camera between two times, in seconds, or None
+                if it is unknown. None if there is no IMU.
+        """
+        self._context, self._turn_between = context, turn_between
         self._first: tuple[Track, Image | None] | None = None
         self._start: TwoViewStart | None = None  # waits for a second pair
 
@@ -145,7 +157,10 @@ class Starter:
         of_1, of_2 = first[0].features, second[0].features
         xy_1, xy_2 = of_1.xy[features[0]].astype(float), of_2.xy[features[1]].astype(float)
         sigma = self._context.scales[of_1.octave[features[0]]]
-        found = reconstruct(xy_1, xy_2, sigma, camera, config, seed=second[0].index)
+        turn = None
+        if self._turn_between is not None:
+            turn = self._turn_between(first[0].timestamp, second[0].timestamp)
+        found = reconstruct(xy_1, xy_2, sigma, camera, config, seed=second[0].index, turn=turn)
         if found is None:
             return None
         match = found.match

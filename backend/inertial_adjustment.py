@@ -32,6 +32,7 @@ from vslam.backend.bundle_adjustment import (
 from vslam.backend.inertial_factor import inertial_factor, information
 from vslam.backend.inertial_filter import inflated
 from vslam.backend.preintegration import Preintegration, preintegrate
+from vslam.support.kernels import kernel
 from vslam.types.geometry import Matrix
 from vslam.types.imu import InertialWindow
 
@@ -221,6 +222,7 @@ def linear_factors(
     gravity, states = inertial[:3], inertial[3:].reshape(-1, N_STATE)
     cost = misfit = 0.0
     of_gravity = n_poses + np.arange(3)
+    at = np.concatenate([np.zeros(30, np.int64), of_gravity])
     for k, (motion, weight) in enumerate(zip(chain.motions, chain.weights, strict=True)):
         ends = chain.camera[k : k + 2]
         r, J = inertial_factor(
@@ -232,17 +234,13 @@ def linear_factors(
             gravity,
             chain.T_imu_camera,
         )
-        weighted = weight @ r
-        cost += 0.5 * float(r @ weighted)
-        misfit += float(r[:9] @ weighted[:9])
         first = n_poses + 3 + N_STATE * k
-        at = np.concatenate(
-            [*(6 * ends[:, None] + np.arange(6)), first + np.arange(2 * N_STATE), of_gravity]
-        )
-        used = np.concatenate([np.repeat(ends < n_free, 6), np.ones(2 * N_STATE + 3, np.bool_)])
-        J, at = J[:, used], at[used]
-        hessian[np.ix_(at, at)] += J.T @ weight @ J
-        gradient[at] -= J.T @ weighted
+        at[:12] = (6 * ends[:, None] + np.arange(6)).ravel()
+        at[:12][np.repeat(ends >= n_free, 6)] = -1  # held fixed
+        at[12:30] = first + np.arange(2 * N_STATE)
+        chi2, of_motion = _add_factor(r, J, weight, at, hessian, gradient)
+        cost += 0.5 * chi2
+        misfit += of_motion
     # The prior of gravity and of the biases of the first keyframe
     at = np.concatenate([of_gravity, n_poses + 3 + 3 + np.arange(6)])
     r = np.concatenate([gravity - chain.gravity, states[0, 3:] - chain.bias])
@@ -251,3 +249,42 @@ def linear_factors(
     gradient[at] -= weighted
     cost += 0.5 * float(r @ weighted)
     return LinearFactors(hessian, gradient, cost, misfit / max(len(chain.motions), 1))
+
+
+@kernel
+def _add_factor(r, J, weight, at, hessian, gradient):
+    """Add a factor with ``(15,)`` residuals to the normal equations.
+
+    Args:
+        at: ``(33,)`` index of the unknown of each column of ``J``; -1 if it is held fixed.
+
+    Returns:
+        Chi-square of all residuals, and of the first nine.
+    """
+    n, m = J.shape
+    weighted = np.zeros((n, m))
+    error = np.zeros(n)
+    chi2 = of_motion = 0.0
+    for i in range(n):
+        for k in range(n):
+            w = weight[i, k]
+            if w != 0.0:
+                error[i] += w * r[k]
+                for j in range(m):
+                    weighted[i, j] += w * J[k, j]
+    for i in range(n):
+        chi2 += r[i] * error[i]
+        if i < 9:
+            of_motion += r[i] * error[i]
+    for a in range(m):
+        if at[a] < 0:
+            continue
+        for i in range(n):
+            value = J[i, a]
+            if value == 0.0:
+                continue
+            gradient[at[a]] -= value * error[i]
+            for b in range(m):
+                if at[b] >= 0:
+                    hessian[at[a], at[b]] += value * weighted[i, b]
+    return chi2, of_motion

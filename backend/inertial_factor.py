@@ -21,22 +21,17 @@ import numpy as np
 from vslam.backend.preintegration import (
     Preintegration,
     cross_matrix,
+    inverse_right_jacobian,
     right_jacobian,
     so3_exp,
     so3_log,
+    times,
 )
+from vslam.support.kernels import inner_kernel, kernel
 from vslam.types.geometry import Matrix
 from vslam.types.imu import ImuNoise
 
 N_RESIDUALS = 15
-# Columns of the Jacobian: the poses, then velocity and biases of both keyframes, then gravity.
-POSE_0, POSE_1, STATE_0, STATE_1, GRAVITY_ = (
-    slice(0, 6),
-    slice(6, 12),
-    slice(12, 21),
-    slice(21, 30),
-    slice(30, 33),
-)
 
 
 def inertial_factor(
@@ -59,49 +54,87 @@ def inertial_factor(
 
     Returns:
         ``(15,)`` residuals of rotation (rad), velocity (m/s), position (m) and biases, and their
-        ``(15, 33)`` derivatives by the increments of both poses, both states, and gravity.
+        ``(15, 33)`` derivatives by the increments of both poses (columns 0 to 11), of both states
+        (columns 12 to 29), and of gravity.
     """
-    dt, R_ic = motion.seconds, T_imu_camera[:3, :3]
-    p_ci = -R_ic.T @ T_imu_camera[:3, 3]
-    R_w0c, R_w1c = T_0w[:3, :3].T, T_1w[:3, :3].T
-    R_0, R_1 = R_w0c @ R_ic.T, R_w1c @ R_ic.T
-    p_0, p_1 = R_w0c @ (p_ci - T_0w[:3, 3]), R_w1c @ (p_ci - T_1w[:3, 3])
-    v_0, v_1, b_0, b_1 = state_0[:3], state_1[:3], state_0[3:], state_1[3:]
-    change = motion.by_bias @ (b_0 - motion.bias)
-    error = (motion.rotation @ so3_exp(change[:3])).T @ R_0.T @ R_1
-    gained = R_0.T @ (v_1 - v_0 - gravity * dt)
-    moved = R_0.T @ (p_1 - p_0 - v_0 * dt - 0.5 * dt * dt * gravity)
-
-    r = np.empty(N_RESIDUALS)
-    r[:3] = so3_log(error)
-    r[3:6] = gained - motion.velocity - change[3:6]
-    r[6:9] = moved - motion.position - change[6:]
-    r[9:] = b_1 - b_0
-
-    J = np.zeros((N_RESIDUALS, 33))
-    of_0, of_1, by_0, by_1, by_g = (
-        J[:, one] for one in (POSE_0, POSE_1, STATE_0, STATE_1, GRAVITY_)
+    return _factor(
+        motion.seconds,
+        motion.rotation,
+        motion.velocity,
+        motion.position,
+        motion.bias,
+        motion.by_bias,
+        T_0w,
+        T_1w,
+        state_0,
+        state_1,
+        gravity,
+        T_imu_camera,
     )
-    of_log = np.linalg.inv(right_jacobian(r[:3]))
-    of_0[:3, 3:] = of_log @ R_1.T @ R_0 @ R_ic
-    of_1[:3, 3:] = -of_log @ R_ic
-    by_0[:3, 3:6] = -of_log @ error.T @ right_jacobian(change[:3]) @ motion.by_bias[:3, :3]
 
-    of_0[3:6, 3:] = -cross_matrix(gained) @ R_ic
-    by_0[3:6, :3], by_1[3:6, :3] = -R_0.T, R_0.T
-    by_0[3:6, 3:] = -motion.by_bias[3:6]
-    by_g[3:6] = -dt * R_0.T
 
-    lever = cross_matrix(p_ci)
-    of_0[6:9, :3] = R_0.T @ R_w0c
-    of_0[6:9, 3:] = -cross_matrix(moved) @ R_ic - R_0.T @ R_w0c @ lever
-    of_1[6:9, :3] = -R_0.T @ R_w1c
-    of_1[6:9, 3:] = R_0.T @ R_w1c @ lever
-    by_0[6:9, :3] = -dt * R_0.T
-    by_0[6:9, 3:] = -motion.by_bias[6:]
-    by_g[6:9] = -0.5 * dt * dt * R_0.T
+@inner_kernel
+def _fill(J, row, column, block):
+    for i in range(3):
+        for j in range(3):
+            J[row + i, column + j] = block[i, j]
 
-    by_0[9:, 3:], by_1[9:, 3:] = -np.eye(6), np.eye(6)
+
+@inner_kernel
+def _applied(A, v):
+    result = np.empty(3)
+    for i in range(3):
+        result[i] = A[i, 0] * v[0] + A[i, 1] * v[1] + A[i, 2] * v[2]
+    return result
+
+
+@kernel
+def _factor(
+    dt, rotation, velocity, position, bias, by_bias, T_0w, T_1w, state_0, state_1, gravity, T_ic
+):
+    R_ic = T_ic[:3, :3]
+    p_ci = -_applied(R_ic.T, T_ic[:3, 3])
+    R_w0c, R_w1c = T_0w[:3, :3].T, T_1w[:3, :3].T
+    R_0, R_1 = times(R_w0c, R_ic.T), times(R_w1c, R_ic.T)
+    p_0, p_1 = _applied(R_w0c, p_ci - T_0w[:3, 3]), _applied(R_w1c, p_ci - T_1w[:3, 3])
+    change = np.zeros(9)
+    for i in range(9):
+        for j in range(6):
+            change[i] += by_bias[i, j] * (state_0[3 + j] - bias[j])
+    error = times(times(rotation, so3_exp(change[:3])).T, times(R_0.T, R_1))
+    gained = _applied(R_0.T, state_1[:3] - state_0[:3] - gravity * dt)
+    moved = _applied(R_0.T, p_1 - p_0 - state_0[:3] * dt - 0.5 * dt * dt * gravity)
+
+    r, J = np.empty(15), np.zeros((15, 33))
+    turn = so3_log(error)
+    for i in range(3):
+        r[i] = turn[i]
+        r[3 + i] = gained[i] - velocity[i] - change[3 + i]
+        r[6 + i] = moved[i] - position[i] - change[6 + i]
+    for i in range(6):
+        r[9 + i] = state_1[3 + i] - state_0[3 + i]
+        J[9 + i, 15 + i], J[9 + i, 24 + i] = -1.0, 1.0
+        for j in range(6):
+            J[3 + j, 15 + i] = -by_bias[3 + j, i]
+
+    of_log = inverse_right_jacobian(turn)
+    _fill(J, 0, 3, times(of_log, times(times(R_1.T, R_0), R_ic)))
+    _fill(J, 0, 9, -times(of_log, R_ic))
+    by_rate = times(right_jacobian(change[:3]), by_bias[:3, :3])
+    _fill(J, 0, 15, -times(of_log, times(error.T, by_rate)))
+
+    _fill(J, 3, 3, -times(cross_matrix(gained), R_ic))
+    _fill(J, 3, 12, -R_0.T)
+    _fill(J, 3, 21, R_0.T)
+    _fill(J, 3, 30, -dt * R_0.T)
+
+    lever, of_0, of_1 = cross_matrix(p_ci), times(R_0.T, R_w0c), times(R_0.T, R_w1c)
+    _fill(J, 6, 0, of_0)
+    _fill(J, 6, 3, -times(cross_matrix(moved), R_ic) - times(of_0, lever))
+    _fill(J, 6, 6, -of_1)
+    _fill(J, 6, 9, times(of_1, lever))
+    _fill(J, 6, 12, -dt * R_0.T)
+    _fill(J, 6, 30, -0.5 * dt * dt * R_0.T)
     return r, J
 
 

@@ -203,8 +203,21 @@ def right_jacobian(w: Matrix) -> Matrix:
     return J
 
 
+@kernel
+def inverse_right_jacobian(w: Matrix) -> Matrix:
+    """Return the ``(3, 3)`` inverse of ``right_jacobian``, for less than 180 degrees."""
+    a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    if a2 < 1e-6:
+        c = 1.0 / 12.0 + a2 / 720.0
+    else:
+        a = np.sqrt(a2)
+        c = 1.0 / a2 - (1.0 + np.cos(a)) / (2.0 * a * np.sin(a))
+    W = cross_matrix(w)
+    return np.eye(3) + 0.5 * W + c * times(W, W)
+
+
 @inner_kernel
-def _times(A: Matrix, B: Matrix) -> Matrix:
+def times(A: Matrix, B: Matrix) -> Matrix:
     """Return the product of two small matrices, always summed in the same order."""
     C = np.zeros((A.shape[0], B.shape[1]))
     for i in range(A.shape[0]):
@@ -258,11 +271,11 @@ def _integrate(
         mean = 0.5 * (value + following) - bias
         w, a = mean[:3], mean[3:]
 
-        half = _times(R, so3_exp(0.5 * h * w))  # the orientation in the middle
+        half = times(R, so3_exp(0.5 * h * w))  # the orientation in the middle
         turn = so3_exp(h * w)
-        force = _times(half, cross_matrix(a))
-        by_angle = _times(force, so3_exp(-0.5 * h * w))
-        by_rate = _times(force, right_jacobian(0.5 * h * w))
+        force = times(half, cross_matrix(a))
+        by_angle = times(force, so3_exp(-0.5 * h * w))
+        by_rate = times(force, right_jacobian(0.5 * h * w))
         by_turn = right_jacobian(h * w)
         for i in range(3):
             for j in range(3):
@@ -275,17 +288,18 @@ def _integrate(
                 B[3 + i, 3 + j] = -h * half[i, j]
                 B[6 + i, 3 + j] = -0.5 * h * h * half[i, j]
             A[6 + i, 3 + i] = h
-        J = _times(A, J) + B
-        P = _times(_times(A, P), A.T)
+        J = times(A, J) + B
+        P = times(times(A, P), A.T)
+        of_gyro, of_accel = sigma_gyro * sigma_gyro / h, sigma_accel * sigma_accel / h
         for i in range(9):
             for j in range(9):
-                for m in range(6):
-                    sigma = sigma_gyro if m < 3 else sigma_accel
-                    P[i, j] += B[i, m] * B[j, m] * sigma * sigma / h
+                gyro = B[i, 0] * B[j, 0] + B[i, 1] * B[j, 1] + B[i, 2] * B[j, 2]
+                accel = B[i, 3] * B[j, 3] + B[i, 4] * B[j, 4] + B[i, 5] * B[j, 5]
+                P[i, j] += of_gyro * gyro + of_accel * accel
         for i in range(3):
             gain = half[i, 0] * a[0] + half[i, 1] * a[1] + half[i, 2] * a[2]
             p[i] += v[i] * h + 0.5 * h * h * gain
             v[i] += h * gain
-        R = _times(R, turn)
+        R = times(R, turn)
         value, time = following, after
     return R, v, p, J, P

@@ -135,7 +135,7 @@ def _read_map(folder: Path) -> None:
             map_.covisible(k)
             map_.keyframe_pose(k)
     if stored.checkpoint is not None:
-        resolve(stored.map.arrays, stored.checkpoint.tracker.landmark)
+        resolve(stored.map.arrays, stored.checkpoint.last.landmark)
 
 
 def _use_map(folder: Path) -> None:

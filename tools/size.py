@@ -15,10 +15,8 @@ import io
 import os
 import subprocess
 import sys
-import tarfile
 import tempfile
 import tokenize
-import zipfile
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from pathlib import Path
@@ -92,9 +90,11 @@ def measure(root: Path) -> tuple[dict[str, Counter[str]], dict[str, str]]:
         build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, str(root)]
         subprocess.run(build, check=True)
         (wheel,) = Path(folder).glob("*.whl")
-        zipfile.ZipFile(wheel).extractall(folder)
+        site = f"{folder}/site"
+        pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", site]
+        subprocess.run([*pip, str(wheel)], check=True)
         ask = [sys.executable, "-c", OPTIONS]
-        environment = os.environ | {"PYTHONPATH": folder}
+        environment = os.environ | {"PYTHONPATH": site}
         asked = subprocess.run(ask, env=environment, check=True, capture_output=True, text=True)
         of_run, of_all = asked.stdout.split()
         megabytes = wheel.stat().st_size / 1e6
@@ -120,12 +120,10 @@ def main() -> None:
     commits = sys.argv[1:] or ["HEAD"]
     found = []
     for commit in commits:
-        archive = subprocess.run(
-            ["git", "archive", commit], cwd=ROOT, check=True, capture_output=True
-        ).stdout
-        with tempfile.TemporaryDirectory() as folder:
-            with tarfile.open(fileobj=io.BytesIO(archive)) as files:
-                files.extractall(folder, filter="data")
+        with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as index:
+            command = ["git", f"--work-tree={folder}", "checkout", "--quiet", commit, "--", ":/"]
+            environment = os.environ | {"GIT_INDEX_FILE": str(Path(index, "index"))}
+            subprocess.run(command, cwd=ROOT, check=True, env=environment)
             found.append(measure(Path(folder)))
     for commit, (packages, _) in zip(commits, found, strict=True):
         rows = [[name, *(f"{packages[name][k]:,}" for k in KINDS)] for name in sorted(packages)]

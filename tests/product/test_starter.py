@@ -148,6 +148,21 @@ def test_a_pair_that_no_later_pair_confirms_begins_no_map():
     np.testing.assert_allclose(start.points, unit * POINTS.xyz[start.features[0]], rtol=1e-3)
 
 
+def test_the_pair_of_the_second_and_a_third_view_confirms_a_start():
+    """The third view shows little that the first view shows, as after fast motion."""
+    one = starter(min_landmarks=50)
+    first, second, third = frame(0, 0.0), frame(1, 0.1, 1.0), frame(2, 0.2, 2.0)
+    strange = np.random.default_rng(1).integers(0, 256, (240, 32), dtype=np.uint8)
+    first.features.descriptors[140:] = strange[140:]
+    third.features.descriptors[:100] = strange[:100]
+    assert one.offer(first, None) is None
+    assert one.offer(second, None) is None
+    start = one.offer(third, None)
+    assert isinstance(start, TwoViewStart)
+    assert (start.first, start.second) == (second, third)
+    assert len(start.points) == 140
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_a_camera_that_only_turns_begins_no_map(seed):
     """Positions of features err by half a pixel."""

@@ -44,7 +44,7 @@ class Codec:
     def encode(self, value: object, name: str) -> tuple[Any, dict[str, NDArray]]:
         """Convert an object to JSON and arrays by name.
 
-        The name of an array is the path of its field, such as "checkpoint.tracker.features.xy" for
+        The name of an array is the path of its field, such as "checkpoint.last.T_cw" for
         ``name="checkpoint"``. It replaces the array in the JSON.
         """
         arrays: dict[str, NDArray] = {}

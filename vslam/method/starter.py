@@ -16,7 +16,7 @@ from vslam.backend.two_views import adjust_two_views
 from vslam.frontend.initialization import KnownTurn, match_views, reconstruct
 from vslam.types.camera import Image
 from vslam.types.context import Context
-from vslam.types.geometry import Matrix, se3_log
+from vslam.types.geometry import Matrix, se3_log, transform
 from vslam.types.track import Track
 
 # Two pairs of frames give the same scene if the ratios of the depths of at least _MIN_COMMON points
@@ -77,12 +77,17 @@ class TwoViewStart:
         T_2_1[:3, 3] *= factor
         return replace(self, T_2_1=T_2_1, points=factor * self.points, predicted=True)
 
-    def agrees(self, other: TwoViewStart) -> bool:
-        """Return whether two starts with the same first frame give the same scene, up to scale."""
-        _, mine, theirs = np.intersect1d(self.features[0], other.features[0], return_indices=True)
+    def agrees(self, before: TwoViewStart) -> bool:
+        """Return whether an earlier start gives the same scene, up to scale. Its first or second
+        frame must be the first frame of this start."""
+        which = 0 if before.first is self.first else 1
+        points = before.points if which == 0 else transform(before.T_2_1, before.points)
+        _, mine, theirs = np.intersect1d(
+            self.features[0], before.features[which], return_indices=True
+        )
         if len(mine) < _MIN_COMMON:
             return False
-        ratio = np.log(self.points[mine, 2] / other.points[theirs, 2])
+        ratio = np.log(self.points[mine, 2] / points[theirs, 2])
         return bool(np.median(np.abs(ratio - np.median(ratio))) <= _MAX_SPREAD)
 
 
@@ -90,7 +95,8 @@ class Starter:
     """Finds the two frames with which a monocular map or sub-map can begin.
 
     A pair of frames can be explained by a wrong motion and a wrong scene. Therefore, a map begins
-    only if two later frames form a pair with the first one, and both pairs give the same scene.
+    only if two pairs give the same scene: a later frame must also form a pair with the first or the
+    second frame.
     """
 
     def __init__(
@@ -133,14 +139,20 @@ class Starter:
             self._keep(second)
             return None
         features = match_views(self._first[0].features, track.features, self._context)
-        if len(features[0]) < config.min_matches:
+        before, enough = self._start, len(features[0]) >= config.min_matches
+        start = self._pair(self._first, second, features) if enough else None
+        if start is not None and (before is None or not start.agrees(before)):
+            self._start = start
+            return None
+        if start is None and before is not None:  # the camera may have moved far since the first
+            middle = before.second, before.images[1]
+            features = match_views(before.second.features, track.features, self._context)
+            start = self._pair(middle, second, features)
+            if start is not None and not start.agrees(before):
+                start = None
+        if start is None and not enough:
             self._keep(second)
-            return None
-        start, before = self._pair(self._first, second, features), self._start
-        if start is None:
-            return None
-        self._start = start
-        return start if before is not None and start.agrees(before) else None
+        return start
 
     def _keep(self, frame: tuple[Track, Image | None]) -> None:
         self._start = None

@@ -278,18 +278,7 @@ def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:
     Loop edges have the Cauchy loss. A loop that contradicts the other loops then loses its
     influence, and ``check_pose_graph`` can detect it. All other edges have a Gaussian loss.
     """
-    import gtsam
-
-    result = optimised_values(
-        graph,
-        [gtsam.Pose3(T_wc) for T_wc in inverses(graph.T_cw)],
-        [gtsam.Pose3(T_i_j) for T_i_j in graph.T_i_j],
-        graph.sigmas[:, ROTATION_FIRST],
-        (gtsam.PriorFactorPose3, gtsam.BetweenFactorPose3),
-        config,
-    )
-    T_wc = np.array([result.atPose3(i).matrix() for i in range(len(graph.T_cw))])
-    T_cw = inverses(T_wc)
+    T_cw = inverses(_optimised_poses(graph, config))
     T_cw[graph.fixed] = graph.T_cw[graph.fixed]
     return T_cw
 
@@ -319,6 +308,23 @@ def optimise_level(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.floa
             known.tolist(), graph.gravity_sigma[known].tolist(), graph.gravity[known], strict=True
         )
     ]
+    T_wc = _optimised_poses(graph, config, hold=np.repeat([1.0, HOLD], 3), factors=attitudes)
+    T_cw = inverses(T_wc) @ (T_wc[fixed] @ graph.T_cw[fixed])
+    T_cw[fixed] = graph.T_cw[fixed]
+    return T_cw
+
+
+def _optimised_poses(
+    graph: PoseGraph,
+    config: PoseGraphConfig,
+    *,
+    hold: NDArray[np.float64] | None = None,
+    factors: Sequence[Any] = (),
+) -> NDArray[np.float64]:
+    """Return the ``(N, 4, 4)`` poses ``T_wc`` that agree best with the edges and with further
+    factors (``optimised_values``)."""
+    import gtsam
+
     result = optimised_values(
         graph,
         [gtsam.Pose3(T_wc) for T_wc in inverses(graph.T_cw)],
@@ -326,13 +332,10 @@ def optimise_level(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.floa
         graph.sigmas[:, ROTATION_FIRST],
         (gtsam.PriorFactorPose3, gtsam.BetweenFactorPose3),
         config,
-        hold=np.repeat([1.0, HOLD], 3),
-        factors=attitudes,
+        hold=hold,
+        factors=factors,
     )
-    T_wc = np.array([result.atPose3(i).matrix() for i in range(len(graph.T_cw))])
-    T_cw = inverses(T_wc) @ (T_wc[fixed] @ graph.T_cw[fixed])
-    T_cw[fixed] = graph.T_cw[fixed]
-    return T_cw
+    return np.array([result.atPose3(i).matrix() for i in range(len(graph.T_cw))])
 
 
 def optimised_values(

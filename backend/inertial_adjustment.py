@@ -33,7 +33,7 @@ from vslam.backend.inertial_factor import inertial_factor, information
 from vslam.backend.inertial_filter import inflated
 from vslam.backend.preintegration import Preintegration, preintegrate
 from vslam.support.kernels import kernel
-from vslam.types.geometry import Matrix
+from vslam.types.geometry import Matrix, inverse
 from vslam.types.imu import InertialWindow
 
 N_STATE = 9  # velocity and biases of a keyframe
@@ -198,7 +198,7 @@ def start_values(T_cw: Matrix, chain: InertialChain) -> Matrix:
     """Return ``(U,)`` gravity and the states of the keyframes, for given ``(K, 4, 4)`` poses."""
     g, T_ic = chain.gravity, chain.T_imu_camera
     states = np.tile(np.r_[np.zeros(3), chain.bias], (len(chain.camera), 1))
-    poses = [np.linalg.inv(T_ic @ T_cw[k]) for k in chain.camera]
+    poses = [inverse(T_ic @ T_cw[k]) for k in chain.camera]
     for k, motion in enumerate(chain.motions):
         t, R = motion.seconds, poses[k][:3, :3]
         moved = poses[k + 1][:3, 3] - poses[k][:3, 3] - R @ motion.position

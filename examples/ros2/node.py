@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import sys
+import time
+from collections import deque
 from functools import partial
 from importlib import import_module
 from typing import Any
 
 import rclpy
 from camera import camera_of
+from diagnostic_msgs.msg import DiagnosticArray
+from imu_input import LONGEST_WAIT_S, ImuInput
 from message_filters import ApproximateTimeSynchronizer, Subscriber
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo, Image
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, Image, Imu
 from tf2_msgs.msg import TFMessage
 
 from vslam import Slam
 from vslam.datasets.bag_messages import grey_of, levels_of_messages, stamp_of
 from vslam.datasets.grey_levels import Levels
-from vslam.maps.ros import FramePose, odometry_message, static_tf_message, tf_message
+from vslam.maps.ros import (
+    FramePose,
+    odometry_message,
+    static_tf_message,
+    status_message,
+    tf_message,
+)
+from vslam.support.errors import InputError
 from vslam.types.features import TrackResult
 
 TOPICS = {
@@ -28,6 +40,7 @@ TOPICS = {
     "right/camera_info": CameraInfo,
 }
 MOST_WAITING = 5  # stereo pairs; if tracking is too slow, older pairs are dropped
+MOST_SAMPLES = 2000  # messages of the IMU that arrive while a frame is tracked
 APART_S = 0.005  # seconds; largest difference between the timestamps of a pair
 
 
@@ -38,44 +51,97 @@ def message_type(name: str) -> Any:
 
 
 class SlamNode(Node):
-    """Tracks each stereo pair, and publishes its pose with the timestamp of the left image."""
+    """Tracks each stereo pair, and publishes its pose with the timestamp of the left image.
+
+    With an IMU, a pair waits until a sample that is not before it has come.
+
+    Raises:
+        InputError: a parameter of the IMU is wrong.
+    """
 
     def __init__(self) -> None:
         super().__init__("vslam")
         self.slam: Slam | None = None
         self.levels: Levels | None = None
         self.before: FramePose | None = None
+        self.said: set[str] = set()
         self.detector = self.declare_parameter("detector", "both").value
         self.map_file = self.declare_parameter("save_map", "").value
+        self.imu = self.subscribe_to_imu()
         self.odometry = self.create_publisher(Odometry, "odom", 10)
         self.tf = self.create_publisher(TFMessage, "/tf", 100)
+        self.status = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.static_tf = self.create_publisher(TFMessage, "/tf_static", kept)
         subscribers = [
             Subscriber(self, kind, topic, qos_profile=qos_profile_sensor_data)
             for topic, kind in TOPICS.items()
         ]
+        self.waiting: deque[tuple[float, tuple[Any, ...]]] = deque(maxlen=MOST_WAITING)
         self.pairs = ApproximateTimeSynchronizer(subscribers, MOST_WAITING, APART_S)
-        self.pairs.registerCallback(self.track)
+        self.pairs.registerCallback(self.receive)
+
+    def subscribe_to_imu(self) -> ImuInput | None:
+        topics, files = (
+            [word for word in self.declare_parameter(name, "").value.split(",") if word]
+            for name in ("imu_topics", "calibration")
+        )
+        if not topics:
+            return None
+        imu = ImuInput(topics, files)
+        kept = QoSProfile(depth=MOST_SAMPLES, reliability=ReliabilityPolicy.BEST_EFFORT)
+        for topic in topics:
+            self.create_subscription(Imu, topic, partial(self.receive_sample, topic), kept)
+        self.create_timer(LONGEST_WAIT_S / 2, self.track_waiting)
+        return imu
+
+    def receive_sample(self, topic: str, message: Imu) -> None:
+        self.imu.add(topic, message)
+        self.track_waiting()
+
+    def receive(self, *pair: Any) -> None:
+        self.waiting.append((time.monotonic(), pair))
+        self.track_waiting()
+
+    def track_waiting(self) -> None:
+        while self.waiting:
+            arrived, pair = self.waiting[0]
+            timestamp, waited_s = stamp_of(pair[0]) / 1e9, time.monotonic() - arrived
+            if self.imu is not None and self.imu.is_awaited(timestamp, waited_s):
+                return
+            self.waiting.popleft()
+            self.track(*pair)
 
     def track(self, left: Image, right: Image, *infos: CameraInfo) -> None:
         stamp = stamp_of(left)
         try:
             if self.slam is None:
-                self.slam = Slam(camera_of(*infos), detector=self.detector)
+                imu = None if self.imu is None else self.imu.calibration(infos[0])
+                self.slam = Slam(camera_of(*infos), detector=self.detector, imu=imu)
                 self.static_tf.publish(static_tf_message(message_type, stamp))
                 self.levels = levels_of_messages((left, right))
+            if self.imu is not None:
+                self.warn_once(*filter(None, [self.imu.complaint(stamp / 1e9)]))
+                self.slam.add_imu(self.imu.samples(stamp / 1e9))
             publish = partial(self.publish, stamp)
             images = (grey_of(image, self.levels) for image in (left, right))
             self.slam.step(*images, stamp / 1e9, on_pose=publish)
+            self.warn_once(*self.slam.problems)
         except ValueError as error:  # a wrong camera, or a clock that was set back
             self.get_logger().warning(f"a pair of images is left out: {error}")
+
+    def warn_once(self, *sentences: str) -> None:
+        for sentence in sentences:
+            if sentence not in self.said:
+                self.get_logger().warning(sentence)
+        self.said.update(sentences)
 
     def publish(self, stamp: int, result: TrackResult) -> None:
         """Publish the pose of a frame before the frame may become a keyframe."""
         pose = FramePose.of(result, stamp)
         self.odometry.publish(odometry_message(message_type, pose, self.before))
         self.tf.publish(tf_message(message_type, pose))
+        self.status.publish(status_message(message_type, stamp, result))
         self.before = pose
 
     def close(self) -> None:
@@ -88,7 +154,12 @@ class SlamNode(Node):
 
 def main() -> None:
     rclpy.init()
-    node = SlamNode()
+    try:
+        node = SlamNode()
+    except InputError as error:
+        rclpy.try_shutdown()
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
     try:
         rclpy.spin(node)
     except KeyboardInterrupt:

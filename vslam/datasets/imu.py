@@ -77,6 +77,15 @@ class ImuFeed:
         recorded = no_samples() if imu.live else imu.recorded.samples
         self._waiting = in_camera_time(recorded, self._offset)
         self._passed = 0
+        self._newest = self._waiting[:, 0].max(initial=-np.inf)
+
+    @property
+    def newest(self) -> float:
+        """Time of the latest sample that has arrived, in seconds of the camera's clock; minus
+        infinity if there is none."""
+        if self._imu.live:
+            self._take_arrived()
+        return float(self._newest)
 
     def until(self, timestamp: float) -> Matrix:
         """Return the samples that come after those of the last call, up to the first one that is
@@ -95,14 +104,18 @@ class ImuFeed:
             arrived.
         """
         if self._imu.live:
-            arrived = in_camera_time(self._imu.read(), self._offset)
-            self._waiting = np.concatenate([self._waiting[self._passed :], arrived])
-            self._passed = 0
+            self._take_arrived()
             end = len(self._waiting)
         else:
             end = int(np.searchsorted(self._waiting[:, 0], timestamp)) + 1
         begin, self._passed = self._passed, max(self._passed, min(end, len(self._waiting)))
         return self._waiting[begin : self._passed]
+
+    def _take_arrived(self) -> None:
+        arrived = in_camera_time(self._imu.read(), self._offset)
+        self._waiting = np.concatenate([self._waiting[self._passed :], arrived])
+        self._passed = 0
+        self._newest = arrived[:, 0].max(initial=self._newest)
 
 
 def joined(gyro: Matrix, accel: Matrix) -> Matrix:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from vslam.maps.level import level_world
 from vslam.support.errors import InputError
-from vslam.types.features import TrackResult
+from vslam.types.features import TrackingState, TrackResult
 from vslam.types.geometry import Matrix, adjoint, inverse, inverses, se3_log
 from vslam.types.trajectory import Trajectory, quaternions
 
@@ -146,6 +146,43 @@ def static_tf_message(types: Types, stamp: int) -> Any:
     """Create ``tf2_msgs/TFMessage`` with ``base_link`` -> ``camera_optical``."""
     transform = _transform(types, stamp, BASE, OPTICAL, T_BASE_OPTICAL)
     return types("tf2_msgs/msg/TFMessage")(transforms=[transform])
+
+
+def status_message(types: Types, stamp: int, result: TrackResult) -> Any:
+    """Create ``diagnostic_msgs/DiagnosticArray`` with the state of a frame as its message.
+
+    Its level is OK if the images gave a pose with enough inliers, ERROR if the pose is only
+    predicted, and WARN otherwise. Its values are the number of inliers, and gravity along the axes
+    of ``map`` in m/s^2, or "unknown".
+
+    Args:
+        stamp: time of the image in nanoseconds.
+    """
+    status = types("diagnostic_msgs/msg/DiagnosticStatus")
+    level = {
+        TrackingState.OK: status.OK,
+        TrackingState.LOST: status.ERROR,
+        TrackingState.DROPPED: status.ERROR,
+    }.get(result.state, status.WARN)
+    known = result.gravity is not None
+    gravity = T_BASE_OPTICAL[:3, :3] @ result.gravity if known else ()
+    values = {
+        "inliers": str(result.n_inliers),
+        "gravity": " ".join(f"{one:.4f}" for one in gravity) if known else "unknown",
+    }
+    pair = types("diagnostic_msgs/msg/KeyValue")
+    return types("diagnostic_msgs/msg/DiagnosticArray")(
+        header=_header(types, stamp, ""),
+        status=[
+            status(
+                level=level,
+                name="vslam: tracking",
+                message=str(result.state),
+                hardware_id="",
+                values=[pair(key=key, value=value) for key, value in values.items()],
+            )
+        ],
+    )
 
 
 def path_message(types: Types, trajectory: Trajectory) -> Any:

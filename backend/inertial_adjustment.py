@@ -11,7 +11,6 @@ A window in which samples and images do not agree is adjusted without the sample
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,11 +28,10 @@ from vslam.backend.bundle_adjustment import (
     step_cameras,
     step_points,
 )
-from vslam.backend.inertial_factor import inertial_factor, information
+from vslam.backend.inertial_factor import Motions, add_factors, add_prior, stacked
 from vslam.backend.inertial_filter import inflated
-from vslam.backend.preintegration import Preintegration, preintegrate
-from vslam.support.kernels import kernel
-from vslam.types.geometry import Matrix, inverse
+from vslam.backend.preintegration import preintegrate
+from vslam.types.geometry import Matrix, inverses
 from vslam.types.imu import InertialWindow
 
 N_STATE = 9  # velocity and biases of a keyframe
@@ -50,7 +48,6 @@ class InertialChain:
     Attributes:
         camera: ``(M,)`` int64, indices of the keyframes in the bundle problem.
         motions: the M - 1 motions between consecutive keyframes.
-        weights: ``(15, 15)`` inverse covariance of each factor.
         T_imu_camera: ``(4, 4)``, maps points of the camera to the IMU.
         gravity: ``(3,)`` expected acceleration of free fall in the world, m/s^2.
         bias: ``(6,)`` expected biases.
@@ -58,8 +55,7 @@ class InertialChain:
     """
 
     camera: NDArray[np.int64]
-    motions: Sequence[Preintegration]
-    weights: Sequence[Matrix]
+    motions: Motions
     T_imu_camera: Matrix
     gravity: Matrix
     bias: Matrix
@@ -99,14 +95,12 @@ def chain_of(
     if not motions:
         return None
     motions.reverse()
-    weights = [information(motion, noise) for motion in motions]
     to_world = np.eye(9)
     to_world[:3, :3] = R_world_camera
     expected = np.linalg.inv(to_world @ window.covariance @ to_world.T)
     return InertialChain(
         camera[-len(motions) - 1 :],
-        motions,
-        weights,
+        stacked(motions, noise),
         window.T_imu_camera,
         R_world_camera @ window.gravity,
         window.bias,
@@ -182,8 +176,9 @@ class LinearFactors:
     """The inertial factors and the prior, linearised.
 
     Attributes:
-        hessian, gradient: ``(S, S)`` and ``(S,)`` of the unknowns: the increments of the free
-            cameras, of gravity, and of the states of the keyframes.
+        hessian, gradient: ``(S, S)``, of which only the upper triangle is used, and ``(S,)`` of
+            the unknowns: the increments of the free cameras, of gravity, and of the states of the
+            keyframes.
         cost: half the sum of the squared residuals.
         misfit: mean chi-square of the residuals of rotation, velocity and position.
     """
@@ -196,14 +191,14 @@ class LinearFactors:
 
 def start_values(T_cw: Matrix, chain: InertialChain) -> Matrix:
     """Return ``(U,)`` gravity and the states of the keyframes, for given ``(K, 4, 4)`` poses."""
-    g, T_ic = chain.gravity, chain.T_imu_camera
+    g, motions = chain.gravity, chain.motions
     states = np.tile(np.r_[np.zeros(3), chain.bias], (len(chain.camera), 1))
-    poses = [inverse(T_ic @ T_cw[k]) for k in chain.camera]
-    for k, motion in enumerate(chain.motions):
-        t, R = motion.seconds, poses[k][:3, :3]
-        moved = poses[k + 1][:3, 3] - poses[k][:3, 3] - R @ motion.position
-        states[k, :3] = moved / t - 0.5 * t * g
-        states[k + 1, :3] = states[k, :3] + t * g + R @ motion.velocity
+    poses = inverses(chain.T_imu_camera @ T_cw[chain.camera])
+    R, t = poses[:-1, :3, :3], motions.seconds[:, None]
+    moved = np.diff(poses[:, :3, 3], axis=0) - np.einsum("nij,nj->ni", R, motions.position)
+    states[:-1, :3] = moved / t - 0.5 * t * g
+    gained = t * g + np.einsum("nij,nj->ni", R, motions.velocity)
+    states[-1, :3] = states[-2, :3] + gained[-1]
     return np.concatenate([g, states.ravel()])
 
 
@@ -216,75 +211,11 @@ def linear_factors(
         T_cw: ``(K, 4, 4)`` poses, of which the first ``n_free`` are optimised.
         inertial: ``(U,)`` gravity and the states of the keyframes.
     """
-    n_poses = 6 * n_free
-    size = n_poses + len(inertial)
+    size = 6 * n_free + len(inertial)
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    gravity, states = inertial[:3], inertial[3:].reshape(-1, N_STATE)
-    cost = misfit = 0.0
-    of_gravity = n_poses + np.arange(3)
-    at = np.concatenate([np.zeros(30, np.int64), of_gravity])
-    for k, (motion, weight) in enumerate(zip(chain.motions, chain.weights, strict=True)):
-        ends = chain.camera[k : k + 2]
-        r, J = inertial_factor(
-            motion,
-            T_cw[ends[0]],
-            T_cw[ends[1]],
-            states[k],
-            states[k + 1],
-            gravity,
-            chain.T_imu_camera,
-        )
-        first = n_poses + 3 + N_STATE * k
-        at[:12] = (6 * ends[:, None] + np.arange(6)).ravel()
-        at[:12][np.repeat(ends >= n_free, 6)] = -1  # held fixed
-        at[12:30] = first + np.arange(2 * N_STATE)
-        chi2, of_motion = _add_factor(r, J, weight, at, hessian, gradient)
-        cost += 0.5 * chi2
-        misfit += of_motion
-    # The prior of gravity and of the biases of the first keyframe
-    at = np.concatenate([of_gravity, n_poses + 3 + 3 + np.arange(6)])
-    r = np.concatenate([gravity - chain.gravity, states[0, 3:] - chain.bias])
-    weighted = chain.information @ r
-    hessian[np.ix_(at, at)] += chain.information
-    gradient[at] -= weighted
-    cost += 0.5 * float(r @ weighted)
-    return LinearFactors(hessian, gradient, cost, misfit / max(len(chain.motions), 1))
-
-
-@kernel
-def _add_factor(r, J, weight, at, hessian, gradient):
-    """Add a factor with ``(15,)`` residuals to the normal equations.
-
-    Args:
-        at: ``(33,)`` index of the unknown of each column of ``J``; -1 if it is held fixed.
-
-    Returns:
-        Chi-square of all residuals, and of the first nine.
-    """
-    n, m = J.shape
-    weighted = np.zeros((n, m))
-    error = np.zeros(n)
-    chi2 = of_motion = 0.0
-    for i in range(n):
-        for k in range(n):
-            w = weight[i, k]
-            if w != 0.0:
-                error[i] += w * r[k]
-                for j in range(m):
-                    weighted[i, j] += w * J[k, j]
-    for i in range(n):
-        chi2 += r[i] * error[i]
-        if i < 9:
-            of_motion += r[i] * error[i]
-    for a in range(m):
-        if at[a] < 0:
-            continue
-        for i in range(n):
-            value = J[i, a]
-            if value == 0.0:
-                continue
-            gradient[at[a]] -= value * error[i]
-            for b in range(m):
-                if at[b] >= 0:
-                    hessian[at[a], at[b]] += value * weighted[i, b]
-    return chi2, of_motion
+    chi2, of_motion = add_factors(
+        chain.motions, chain.camera, T_cw, n_free, inertial, chain.T_imu_camera, hessian, gradient
+    )
+    error = np.concatenate([inertial[:3] - chain.gravity, inertial[6:12] - chain.bias])
+    chi2 += add_prior(error, chain.information, n_free, hessian, gradient)
+    return LinearFactors(hessian, gradient, 0.5 * chi2, of_motion / len(chain.motions.seconds))

@@ -16,6 +16,9 @@ world by ``R_wc (p_ci x phi - rho)``, where ``p_ci`` is the position of the IMU 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from vslam.backend.preintegration import (
@@ -138,14 +141,143 @@ def _factor(
     return r, J
 
 
-def information(motion: Preintegration, noise: ImuNoise) -> Matrix:
-    """Return the ``(15, 15)`` inverse covariance of the residuals of an inertial factor.
+class Motions(NamedTuple):
+    """The motions between N + 1 consecutive keyframes, as an argument of kernels. The same biases
+    were subtracted from all of them.
+
+    Attributes:
+        seconds: ``(N,)``.
+        rotation, velocity, position, by_bias: ``(N, 3, 3)``, ``(N, 3)``, ``(N, 3)`` and
+            ``(N, 9, 6)``, see ``Preintegration``.
+        bias: ``(6,)`` biases that were subtracted.
+        information: ``(N, 15, 15)`` inverse covariances of the residuals.
+    """
+
+    seconds: Matrix
+    rotation: Matrix
+    velocity: Matrix
+    position: Matrix
+    by_bias: Matrix
+    bias: Matrix
+    information: Matrix
+
+
+def stacked(motions: Sequence[Preintegration], noise: ImuNoise) -> Motions:
+    """Stack motions, at least one, from which the same biases were subtracted.
 
     Args:
         noise: gives the random walks of the biases.
     """
-    walks = np.repeat(np.square([noise.gyro_walk, noise.accel_walk]), 3) * motion.seconds
-    result = np.zeros((N_RESIDUALS, N_RESIDUALS))
-    result[:9, :9] = np.linalg.inv(motion.covariance)
-    result[9:, 9:] = np.diag(1.0 / walks)
-    return result
+    seconds = np.array([motion.seconds for motion in motions])
+    walks = np.square([*[noise.gyro_walk] * 3, *[noise.accel_walk] * 3])
+    information = np.zeros((len(motions), N_RESIDUALS, N_RESIDUALS))
+    information[:, :9, :9] = np.linalg.inv([motion.covariance for motion in motions])
+    information[:, range(9, 15), range(9, 15)] = 1.0 / (seconds[:, None] * walks)
+    return Motions(
+        seconds,
+        np.array([motion.rotation for motion in motions]),
+        np.array([motion.velocity for motion in motions]),
+        np.array([motion.position for motion in motions]),
+        np.array([motion.by_bias for motion in motions]),
+        motions[0].bias,
+        information,
+    )
+
+
+@kernel
+def add_factors(motions, camera, T_cw, n_free, inertial, T_imu_camera, hessian, gradient):
+    """Add the inertial factors between consecutive keyframes to the normal equations.
+
+    Args:
+        camera: ``(N + 1,)`` int64, indices of the keyframes.
+        T_cw: ``(K, 4, 4)`` poses, of which the first ``n_free`` are optimised.
+        inertial: gravity, and the state of each of these keyframes (``inertial_factor``).
+        hessian, gradient: of the increments of the free cameras, of gravity, and of the states.
+            Only the upper triangle of the Hessian is written.
+
+    Returns:
+        Chi-square of all residuals, and of those of rotation, velocity and position.
+    """
+    at = np.empty(33, np.int64)
+    n_poses = 6 * n_free
+    gravity = inertial[:3]
+    chi2, of_motion = 0.0, 0.0
+    for k in range(len(motions.seconds)):
+        first = 3 + 9 * k
+        r, J = _factor(
+            motions.seconds[k],
+            motions.rotation[k],
+            motions.velocity[k],
+            motions.position[k],
+            motions.bias,
+            motions.by_bias[k],
+            T_cw[camera[k]],
+            T_cw[camera[k + 1]],
+            inertial[first : first + 9],
+            inertial[first + 9 : first + 18],
+            gravity,
+            T_imu_camera,
+        )
+        for i in range(6):
+            for end in range(2):
+                at[6 * end + i] = 6 * camera[k + end] + i if camera[k + end] < n_free else -1
+        for i in range(18):
+            at[12 + i] = n_poses + first + i
+        for i in range(3):
+            at[30 + i] = n_poses + i
+        one, moved = _add_residuals(r, J, motions.information[k], at, hessian, gradient)
+        chi2 += one
+        of_motion += moved
+    return chi2, of_motion
+
+
+@kernel
+def add_prior(error, information, n_free, hessian, gradient):
+    """Add a prior of gravity and of the biases of the first keyframe, and return its chi-square.
+
+    Args:
+        error: ``(9,)`` deviation of gravity and the biases from what is expected.
+        n_free, hessian, gradient: see ``add_factors``.
+    """
+    at = np.arange(6 * n_free, 6 * n_free + 9)
+    at[3:] += 3  # the velocity is between gravity and the biases
+    chi2, _ = _add_residuals(error, np.eye(9), information, at, hessian, gradient)
+    return chi2
+
+
+@inner_kernel
+def _add_residuals(r, J, information, at, hessian, gradient):
+    """Add residuals to the normal equations.
+
+    Args:
+        at: index of the unknown of each column of ``J``; -1 if it is held fixed.
+
+    Returns:
+        Chi-square of all residuals, and of the first nine.
+    """
+    n, m = J.shape
+    weighted, error = np.zeros((n, m)), np.zeros(n)
+    chi2, of_motion = 0.0, 0.0
+    for i in range(n):
+        for k in range(n):
+            w = information[i, k]
+            if w != 0.0:
+                error[i] += w * r[k]
+                for j in range(m):
+                    weighted[i, j] += w * J[k, j]
+        chi2 += r[i] * error[i]
+        if i < 9:
+            of_motion += r[i] * error[i]
+    for a in range(m):
+        row = at[a]
+        if row < 0:
+            continue
+        for i in range(n):
+            value = J[i, a]
+            if value == 0.0:
+                continue
+            gradient[row] -= value * error[i]
+            for b in range(m):
+                if at[b] >= row:
+                    hessian[row, at[b]] += value * weighted[i, b]
+    return chi2, of_motion

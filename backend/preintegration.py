@@ -21,7 +21,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vslam.support.kernels import inner_kernel, kernel
 from vslam.types.geometry import Matrix
@@ -125,38 +124,33 @@ def preintegrate(
         raise ValueError("there are no inertial samples to integrate")
     if not end >= start:
         raise ValueError(f"the interval ends at {end} s, before it begins at {start} s")
-    times = samples[:, 0]
-    inside = slice(
-        max(int(np.searchsorted(times, start, "right")) - 1, 0),
-        int(np.searchsorted(times, end, "left")) + 1,
+    R, v, p, by_bias, covariance, gap = _integrate(
+        np.ascontiguousarray(samples),
+        start,
+        end,
+        np.ascontiguousarray(bias),
+        noise.gyro,
+        noise.accel,
     )
-    rows = np.ascontiguousarray(samples[inside])
-    found = _integrate(rows, start, end, np.ascontiguousarray(bias), noise.gyro, noise.accel)
-    R, v, p, by_bias, covariance = found
-    gap = _longest_gap(rows[:, 0], start, end)
     return Preintegration(end - start, R, v, p, np.array(bias), by_bias, covariance, gap)
-
-
-def _longest_gap(times: NDArray[np.float64], start: float, end: float) -> float:
-    """Return the longest time without a sample, of those that touch an interval, in seconds.
-
-    Args:
-        times: of the samples from the last one before the interval to the first one after it.
-    """
-    known = np.concatenate([[min(start, times[0])], times, [max(end, times[-1])]])
-    return float(np.diff(known).max())
 
 
 @kernel
 def so3_exp(w: Matrix) -> Matrix:
     """Return the ``(3, 3)`` rotation of a ``(3,)`` rotation vector (Rodrigues)."""
+    R = np.empty((3, 3))
+    _write_exp(w, R)
+    return R
+
+
+@inner_kernel
+def _write_exp(w: Matrix, R: Matrix) -> None:
     a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     if a2 < 1e-8:
         s, c = 1.0 - a2 / 6.0, 0.5 - a2 / 24.0
     else:
         a = np.sqrt(a2)
         s, c = np.sin(a) / a, 2.0 * np.sin(0.5 * a) ** 2 / a2
-    R = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             R[i, j] = c * w[i] * w[j]
@@ -167,7 +161,6 @@ def so3_exp(w: Matrix) -> Matrix:
     R[1, 2] -= s * w[0]
     R[2, 0] -= s * w[1]
     R[2, 1] += s * w[0]
-    return R
 
 
 @kernel
@@ -183,13 +176,19 @@ def so3_log(R: Matrix) -> Matrix:
 @kernel
 def right_jacobian(w: Matrix) -> Matrix:
     """Return ``(3, 3)`` J with ``exp(w + d) = exp(w) exp(J d)`` for small d."""
+    J = np.empty((3, 3))
+    _write_right_jacobian(w, J)
+    return J
+
+
+@inner_kernel
+def _write_right_jacobian(w: Matrix, J: Matrix) -> None:
     a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     if a2 < 1e-6:
         b, c = 0.5 - a2 / 24.0, 1.0 / 6.0 - a2 / 120.0
     else:
         a = np.sqrt(a2)
         b, c = 2.0 * np.sin(0.5 * a) ** 2 / a2, (a - np.sin(a)) / (a2 * a)
-    J = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             J[i, j] = c * w[i] * w[j]
@@ -200,7 +199,6 @@ def right_jacobian(w: Matrix) -> Matrix:
     J[1, 2] += b * w[0]
     J[2, 0] += b * w[1]
     J[2, 1] -= b * w[0]
-    return J
 
 
 @kernel
@@ -234,72 +232,113 @@ def cross_matrix(v: Matrix) -> Matrix:
 
 
 @inner_kernel
-def _value_at(rows: Matrix, k: int, time: float) -> Matrix:
-    """Return the ``(6,)`` rate and force at a time, which is not before the sample k."""
-    if time <= rows[k, 0] or k + 1 == len(rows):
-        return rows[k, 1:].copy()
-    share = (time - rows[k, 0]) / (rows[k + 1, 0] - rows[k, 0])
-    return (1.0 - share) * rows[k, 1:] + share * rows[k + 1, 1:]
+def _write_product(A: Matrix, B: Matrix, C: Matrix) -> None:
+    for i in range(3):
+        for j in range(3):
+            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+
+
+@inner_kernel
+def _write_value(samples: Matrix, k: int, time: float, value: Matrix) -> None:
+    """Write the ``(6,)`` rate and force at a time, which is not before the sample k."""
+    share = 0.0
+    if time > samples[k, 0] and k + 1 < len(samples):
+        share = (time - samples[k, 0]) / (samples[k + 1, 0] - samples[k, 0])
+    for i in range(6):
+        value[i] = samples[k, 1 + i]
+        if share > 0.0:
+            value[i] = (1.0 - share) * value[i] + share * samples[k + 1, 1 + i]
+
+
+@inner_kernel
+def _carry(turn: Matrix, by_angle: Matrix, h: float, X: Matrix) -> None:
+    """Carry errors of rotation, velocity and position, the rows of ``X``, over one interval."""
+    for j in range(X.shape[1]):
+        x, y, z = X[0, j], X[1, j], X[2, j]
+        for i in range(3):
+            moved = by_angle[i, 0] * x + by_angle[i, 1] * y + by_angle[i, 2] * z
+            X[6 + i, j] += h * X[3 + i, j] - 0.5 * h * h * moved
+            X[3 + i, j] -= h * moved
+            X[i, j] = turn[0, i] * x + turn[1, i] * y + turn[2, i] * z
 
 
 @kernel
 def _integrate(
-    rows: Matrix, start: float, end: float, bias: Matrix, sigma_gyro: float, sigma_accel: float
-) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
-    """Integrate samples from the last one before ``start`` to the first one after ``end``.
+    samples: Matrix, start: float, end: float, bias: Matrix, sigma_gyro: float, sigma_accel: float
+) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix, float]:
+    """Integrate samples.
 
     Returns:
         ``(3, 3)`` rotation, ``(3,)`` velocity, ``(3,)`` position, ``(9, 6)`` derivatives by the
-        biases, and the ``(9, 9)`` covariance (``Preintegration``).
+        biases, the ``(9, 9)`` covariance, and the longest gap (``Preintegration``).
     """
     R, v, p = np.eye(3), np.zeros(3), np.zeros(3)
     J, P = np.zeros((9, 6)), np.zeros((9, 9))
-    A, B = np.eye(9), np.zeros((9, 6))
-    k, time = 0, start
-    value = _value_at(rows, 0, start)
+    G = np.empty((9, 3))  # derivatives of the interval by the rate
+    half, half_turn, turn = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    force, by_angle, by_rate = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    by_turn, cross = np.empty((3, 3)), np.zeros((3, 3))
+    value, following = np.empty(6), np.empty(6)
+    angle, half_angle, a = np.empty(3), np.empty(3), np.empty(3)
+    n = len(samples)
+    k = max(np.searchsorted(samples[:, 0], start, side="right") - 1, 0)
+    gap = max(samples[k, 0] - start, 0.0)
+    time = start
+    _write_value(samples, k, start, value)
     while time < end:
-        while k + 1 < len(rows) and rows[k + 1, 0] <= time:
+        while k + 1 < n and samples[k + 1, 0] <= time:
             k += 1
         after = end
-        if rows[k, 0] > time:
-            after = min(end, rows[k, 0])
-        elif k + 1 < len(rows):
-            after = min(end, rows[k + 1, 0])
-        at = k + 1 if k + 1 < len(rows) and rows[k + 1, 0] <= after else k
-        following = _value_at(rows, at, after)
+        if samples[k, 0] > time:
+            after = min(end, samples[k, 0])
+        elif k + 1 < n:
+            after = min(end, samples[k + 1, 0])
+            gap = max(gap, samples[k + 1, 0] - samples[k, 0])
+        else:
+            gap = max(gap, end - samples[k, 0])
+        at = k + 1 if k + 1 < n and samples[k + 1, 0] <= after else k
+        _write_value(samples, at, after, following)
         h = after - time
-        mean = 0.5 * (value + following) - bias
-        w, a = mean[:3], mean[3:]
+        for i in range(3):
+            angle[i] = h * (0.5 * (value[i] + following[i]) - bias[i])
+            half_angle[i] = 0.5 * angle[i]
+            a[i] = 0.5 * (value[3 + i] + following[3 + i]) - bias[3 + i]
+        _write_exp(half_angle, half_turn)
+        _write_exp(angle, turn)
+        _write_product(R, half_turn, half)  # the orientation in the middle
+        cross[0, 1], cross[0, 2], cross[1, 2] = -a[2], a[1], -a[0]
+        cross[1, 0], cross[2, 0], cross[2, 1] = a[2], -a[1], a[0]
+        _write_product(half, cross, force)
+        _write_product(force, half_turn.T, by_angle)
+        _write_right_jacobian(half_angle, by_turn)
+        _write_product(force, by_turn, by_rate)
+        _write_right_jacobian(angle, by_turn)
 
-        half = times(R, so3_exp(0.5 * h * w))  # the orientation in the middle
-        turn = so3_exp(h * w)
-        force = times(half, cross_matrix(a))
-        by_angle = times(force, so3_exp(-0.5 * h * w))
-        by_rate = times(force, right_jacobian(0.5 * h * w))
-        by_turn = right_jacobian(h * w)
+        _carry(turn, by_angle, h, J)
+        _carry(turn, by_angle, h, P)
+        _carry(turn, by_angle, h, P.T)
         for i in range(3):
             for j in range(3):
-                A[i, j] = turn[j, i]
-                A[3 + i, j] = -h * by_angle[i, j]
-                A[6 + i, j] = -0.5 * h * h * by_angle[i, j]
-                B[i, j] = -h * by_turn[i, j]
-                B[3 + i, j] = 0.5 * h * h * by_rate[i, j]
-                B[6 + i, j] = 0.25 * h * h * h * by_rate[i, j]
-                B[3 + i, 3 + j] = -h * half[i, j]
-                B[6 + i, 3 + j] = -0.5 * h * h * half[i, j]
-            A[6 + i, 3 + i] = h
-        J = times(A, J) + B
-        P = times(times(A, P), A.T)
-        of_gyro, of_accel = sigma_gyro * sigma_gyro / h, sigma_accel * sigma_accel / h
+                G[i, j] = -h * by_turn[i, j]
+                G[3 + i, j] = 0.5 * h * h * by_rate[i, j]
+                G[6 + i, j] = 0.25 * h * h * h * by_rate[i, j]
+                J[3 + i, 3 + j] -= h * half[i, j]
+                J[6 + i, 3 + j] -= 0.5 * h * h * half[i, j]
+        of_gyro, of_accel = sigma_gyro * sigma_gyro / h, sigma_accel * sigma_accel * h
         for i in range(9):
+            for j in range(3):
+                J[i, j] += G[i, j]
             for j in range(9):
-                gyro = B[i, 0] * B[j, 0] + B[i, 1] * B[j, 1] + B[i, 2] * B[j, 2]
-                accel = B[i, 3] * B[j, 3] + B[i, 4] * B[j, 4] + B[i, 5] * B[j, 5]
-                P[i, j] += of_gyro * gyro + of_accel * accel
+                P[i, j] += of_gyro * (G[i, 0] * G[j, 0] + G[i, 1] * G[j, 1] + G[i, 2] * G[j, 2])
+        for i in range(3):
+            P[3 + i, 3 + i] += of_accel
+            P[3 + i, 6 + i] += 0.5 * h * of_accel
+            P[6 + i, 3 + i] += 0.5 * h * of_accel
+            P[6 + i, 6 + i] += 0.25 * h * h * of_accel
         for i in range(3):
             gain = half[i, 0] * a[0] + half[i, 1] * a[1] + half[i, 2] * a[2]
             p[i] += v[i] * h + 0.5 * h * h * gain
             v[i] += h * gain
-        R = times(R, turn)
-        value, time = following, after
-    return R, v, p, J, P
+        _write_product(half, half_turn, R)
+        value, following, time = following, value, after
+    return R, v, p, J, P, gap

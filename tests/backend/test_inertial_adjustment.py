@@ -17,7 +17,7 @@ from vslam.backend.inertial_adjustment import (
     linear_factors,
     start_values,
 )
-from vslam.backend.inertial_factor import inertial_factor, information
+from vslam.backend.inertial_factor import inertial_factor, stacked
 from vslam.backend.preintegration import preintegrate, so3_exp, so3_log
 from vslam.types.camera import Camera
 from vslam.types.geometry import inverse, se3_exp, transform
@@ -97,7 +97,7 @@ def test_the_cost_is_gtsams():
     expected = gtsam.ImuFactor(0, 2, 1, 3, 4, theirs).error(values)
     motion = preintegrate(rows, 1.0, 1.4, ADIS16448, BIAS)
     r, _ = inertial_factor(motion, *T, np.r_[v[0], BIAS], np.r_[v[1], BIAS], DOWN, T_IC)
-    ours = 0.5 * r @ information(motion, ADIS16448) @ r
+    ours = 0.5 * r @ stacked([motion], ADIS16448).information[0] @ r
     assert ours == pytest.approx(expected, rel=2e-3)
     assert expected > 100.0
 

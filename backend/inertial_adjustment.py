@@ -29,7 +29,7 @@ from vslam.backend.bundle_adjustment import (
     step_points,
 )
 from vslam.backend.inertial_factor import Motions, add_factors, add_prior, stacked
-from vslam.backend.inertial_filter import inflated
+from vslam.backend.inertial_filter import FALL_AND_BIAS, inflated
 from vslam.backend.preintegration import preintegrate
 from vslam.types.geometry import Matrix, inverses
 from vslam.types.imu import InertialWindow
@@ -82,28 +82,30 @@ def chain_of(
         times: ``(M,)`` seconds.
         R_world_camera: ``(3, 3)`` rotation of the last of these keyframes.
     """
-    noise, motions = inflated(window.noise), []
+    noise, motions, state = inflated(window.noise), [], window.state
     since = window.samples[0, 0] if len(window.samples) else np.inf
     for k in range(len(times) - 1, 0, -1):
         start, end = float(times[k - 1]), float(times[k])
         if start < since or end - start > LONGEST_S:
             break
-        motion = preintegrate(window.samples, start, end, noise, window.bias)
+        motion = preintegrate(window.samples, start, end, noise, state.bias)
         if motion.longest_gap > window.longest_gap:
             break
         motions.append(motion)
     if not motions:
         return None
     motions.reverse()
+    R_world_odom = R_world_camera @ window.R_odom_camera.T
     to_world = np.eye(9)
-    to_world[:3, :3] = R_world_camera
-    expected = np.linalg.inv(to_world @ window.covariance @ to_world.T)
+    to_world[:3, :3] = R_world_odom
+    covariance = state.covariance[FALL_AND_BIAS, FALL_AND_BIAS]
+    expected = np.linalg.inv(to_world @ covariance @ to_world.T)
     return InertialChain(
         camera[-len(motions) - 1 :],
         stacked(motions, noise),
         window.T_imu_camera,
-        R_world_camera @ window.gravity,
-        window.bias,
+        R_world_odom @ state.gravity,
+        state.bias,
         0.5 * (expected + expected.T),
     )
 

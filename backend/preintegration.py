@@ -263,9 +263,7 @@ def _carry(turn: Matrix, by_angle: Matrix, h: float, X: Matrix) -> None:
 
 
 @kernel
-def _integrate(
-    samples: Matrix, start: float, end: float, bias: Matrix, sigma_gyro: float, sigma_accel: float
-) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix, float]:
+def _integrate(samples, start, end, bias, sigma_gyro, sigma_accel):
     """Integrate samples.
 
     Returns:

@@ -21,7 +21,7 @@ from vslam.backend.inertial_factor import inertial_factor, stacked
 from vslam.backend.preintegration import preintegrate, so3_exp, so3_log
 from vslam.types.camera import Camera
 from vslam.types.geometry import inverse, se3_exp, transform
-from vslam.types.imu import InertialWindow
+from vslam.types.imu import InertialState, InertialWindow
 
 CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480)
 T_IC = np.eye(4)
@@ -29,7 +29,7 @@ T_IC[:3, :3] = so3_exp(np.array([0.3, -1.2, 0.7]))
 T_IC[:3, 3] = 0.1, -0.05, 0.2
 BIAS = np.array([0.01, -0.02, 0.015, 0.1, -0.05, 0.08])
 FLIGHT = Flight(seed=3)
-PRIOR = np.diag(np.square([*[0.05] * 3, *[0.01] * 3, *[0.1] * 3]))
+SIGMAS = np.repeat([0.0, 0.0, 0.0, 0.05, 0.01, 0.1], 3)  # of the filter's state
 
 
 def camera_at(t: float, flight: Flight = FLIGHT) -> np.ndarray:
@@ -42,7 +42,10 @@ def samples(noise=None, seed: int = 0, rate: float = 200.0, flight: Flight = FLI
 
 
 def window(rows: np.ndarray, **changes) -> InertialWindow:
-    found = InertialWindow(rows, DOWN, BIAS, PRIOR, T_IC, ADIS16448, 0.1)
+    state = InertialState(0.0, np.eye(4), np.zeros(3), DOWN, BIAS, np.diag(SIGMAS**2))
+    given = {one: changes.pop(one) for one in ("gravity", "bias") if one in changes}
+    state = replace(state, **given)
+    found = InertialWindow(rows, state, np.eye(3), T_IC, ADIS16448, 0.1)
     return replace(found, **changes)
 
 
@@ -225,3 +228,16 @@ def test_a_chain_begins_after_the_last_gap():
         *range(3, 8),
     ]
     assert chain_of(window(rows[:0]), camera, times, np.eye(3)) is None
+
+
+def test_the_state_of_the_filter_is_turned_into_the_world():
+    """The window is the same after the odometry and the world were turned apart."""
+    times, R = 0.5 + 0.3 * np.arange(3), so3_exp(np.array([0.4, 1.0, -2.0]))
+    sigmas = np.diag([1.0, 2.0, 3.0])
+    given, covariance = window(samples()), np.diag(SIGMAS**2)
+    covariance[9:12, 9:12] = R @ sigmas @ R.T
+    state = replace(given.state, gravity=R @ DOWN, covariance=covariance)
+    made = chain_of(replace(given, state=state, R_odom_camera=R), np.arange(3), times, np.eye(3))
+    assert made is not None
+    np.testing.assert_allclose(made.gravity, DOWN, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.inv(made.information)[:3, :3], sigmas, atol=1e-12)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vslam.backend.inertial_filter import FALL_AND_BIAS, camera_pose
+from vslam.backend.inertial_filter import camera_pose
 from vslam.backend.inertial_start import GravityState
 from vslam.frontend.initialization import KnownTurn
 from vslam.frontend.motion_time import RECENT, motion_seconds
@@ -267,20 +267,13 @@ class Motion:
 
     def _window(self, state: InertialState, imu: ImuCalibration) -> InertialWindow:
         """Return what local bundle adjustment needs to know from the IMU at this frame."""
-        camera, turn = self._context.camera, np.eye(9)
-        R_camera_odom = self.state.odometry.T_odom_camera[:3, :3].T
+        camera, R_odom_camera = self._context.camera, self.state.odometry.T_odom_camera[:3, :3]
+        T_imu_camera = imu.T_imu_camera
         if camera.quarter_turns:
-            R_camera_odom = camera.T_mounted_camera[:3, :3].T @ R_camera_odom
-        turn[:3, :3] = R_camera_odom
-        return InertialWindow(
-            self.state.inertia.samples,
-            R_camera_odom @ state.gravity,
-            state.bias,
-            turn @ state.covariance[FALL_AND_BIAS, FALL_AND_BIAS] @ turn.T,
-            imu.T_imu_camera @ camera.T_mounted_camera,
-            imu.noise,
-            LONGEST_GAP,
-        )
+            T = camera.T_mounted_camera
+            R_odom_camera, T_imu_camera = R_odom_camera @ T[:3, :3], T_imu_camera @ T
+        samples = self.state.inertia.samples
+        return InertialWindow(samples, state, R_odom_camera, T_imu_camera, imu.noise, LONGEST_GAP)
 
     def turn_between(self, start: float, end: float) -> KnownTurn | None:
         """Return the rotation of the camera between two times, in seconds, as the gyroscope

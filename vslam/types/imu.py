@@ -265,18 +265,16 @@ class InertialWindow:
 
     Attributes:
         samples: ``(N, 7)`` samples up to the frame, see the top of this module.
-        gravity: ``(3,)`` acceleration of free fall in the frame of the camera, m/s^2.
-        bias: ``(6,)`` biases of gyroscope and accelerometer.
-        covariance: ``(9, 9)`` of gravity and the biases.
+        state: the state of the IMU, in the frame of the odometry.
+        R_odom_camera: ``(3, 3)`` rotation of the tracked camera in the frame of the odometry.
         T_imu_camera: ``(4, 4)``, maps points of the tracked camera to the IMU.
         noise: of the IMU at rest.
         longest_gap: seconds between two samples above which they do not tell the motion.
     """
 
     samples: Matrix
-    gravity: Matrix
-    bias: Matrix
-    covariance: Matrix
+    state: InertialState
+    R_odom_camera: Matrix
     T_imu_camera: Matrix
     noise: ImuNoise
     longest_gap: float

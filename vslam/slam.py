@@ -375,6 +375,11 @@ class Slam:
         """Return the poses of the keyframes of this drive, without culled keyframes."""
         return _as_mounted(keyframe_trajectory(self.map), self.context.camera)
 
+    def tracked(self) -> NDArray[np.bool_]:
+        """Return an ``(N,)`` bool array, True for frames whose pose was found by their images, at
+        the time of tracking or later."""
+        return self._session.published.frames.table().tracked
+
     def in_map(self) -> NDArray[np.bool_]:
         """Return an ``(N,)`` bool array, True for frames that were tracked in the first sub-map.
 

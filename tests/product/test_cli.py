@@ -567,7 +567,8 @@ def test_compare_prints_a_row_for_each_detector(call, root, with_detector):
     assert re.search("5.0 fps .* 3 detectors together", out)
     head, *rows = detectors_in(out)
     assert head == [
-        "detector", "lost", "ATE", "causal ATE", "RPE", "loops found", "missed", "wrong", "time",
+        "detector", "lost", "ATE", "causal ATE", "RPE", "RPE rotation",
+        "loops found", "missed", "wrong", "time",
     ]  # fmt: skip
     assert [row[0] for row in rows] == ["bow", "both", "none"]
     assert rows[0][1:3] == ["1", "0.000 m"]

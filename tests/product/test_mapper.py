@@ -406,7 +406,8 @@ def begin_with_two_views(drive: Drive) -> None:
         drive.published.record(lost)
     every = np.arange(len(POINTS.xyz))
     views, images = (frames[0], frames[3]), (None, None)
-    drive.last = drive.mapper.begin(TwoViewStart(*views, images, at(3), (every, every), POINTS.xyz))
+    start = TwoViewStart(*views, images, at(3), (every, every), POINTS.xyz)
+    _, drive.last = drive.mapper.begin(start)
 
 
 def test_a_monocular_map_begins_with_two_keyframes():

@@ -64,6 +64,19 @@ def test_a_map_begins_within_ten_frames_and_tracks_all_others(check_map):
     check_map(slam.map)
 
 
+def test_the_frames_before_the_map_get_their_poses_when_it_begins():
+    """The camera stands for 12 frames, and then moves."""
+    frames = [*(3.0 + 1e-6 * k for k in range(12)), *(3.0 + k for k in range(30))]
+    slam, results = run(frames)
+    n_lost = sum(r.state is TrackingState.LOST for r in results)
+    assert n_lost > 12
+    assert slam.tracked().all()
+    assert not slam.gaps()
+    assert error(slam, frames, slice(0, n_lost + 4)) < 0.05
+    turns = slam.trajectory().T_wc[:12, :3, :3]
+    assert np.abs(turns - turns[0]).max() < 1e-3
+
+
 def test_the_first_landmarks_make_the_unit():
     slam, results = run(ROUND[:6])
     second = next(r.index for r in results if r.is_keyframe)
@@ -112,6 +125,7 @@ def test_a_sub_map_goes_on_at_the_speed_before():
     tracked = np.array([r.state is not TrackingState.LOST for r in results])
     assert np.median(steps[50:]) == pytest.approx(np.median(steps[30:39]), rel=0.1)
     assert tracked[50:].all()
+    assert slam.tracked()[40:].all()  # also the frames in which the camera was lost
     assert len(slam.trajectory()) == 80
 
 

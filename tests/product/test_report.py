@@ -477,7 +477,8 @@ def test_comparison_is_in_every_text(looped: tuple[RunOutcome, Path]) -> None:
             cells = [
                 row, str(found.lost_frames), f"{found.ate_rmse_m:.3f} m",
                 f"{found.causal_ate_rmse_m:.3f} m", f"{found.rpe_m:.4f} m",
-                f"{found.t_rel_percent:.3f} %", str(found.loops_found), str(found.loops_missed),
+                f"{found.rpe_deg:.4f}°", f"{found.t_rel_percent:.3f} %",
+                str(found.loops_found), str(found.loops_missed),
                 str(found.loops_wrong), f"{found.seconds:.1f} s",
             ]  # fmt: skip
             between = r"\s*(\||</td><td[^>]*>)\s*"
@@ -737,6 +738,16 @@ def test_ground_truth_of_some_frames(tmp_path: Path) -> None:
         read_trajectory(tmp_path / name) for name in ("ground_truth.tum", "trajectory.tum")
     )
     assert evaluate_trajectory(estimate, truth).ate_rmse_m == pytest.approx(report.ate_rmse_m)
+
+
+def test_frames_whose_poses_were_found_later_are_not_lost(tmp_path: Path) -> None:
+    outcome = monocular(make_outcome(40, lost=slice(0, 5)))
+    later = [replace(track, state=TrackingState.LATER) for track in outcome.tracks[1:5]]
+    outcome = replace(outcome, tracks=[outcome.tracks[0], *later, *outcome.tracks[5:]])
+    assert outcome.n_tracked == 39
+    report = report_of(outcome, tmp_path)
+    assert (report.lost_frames, report.later_frames, report.lost_before_map) == (1, 4, 1)
+    assert "4 found after the map began" in (tmp_path / "report.md").read_text()
 
 
 def test_of_one_frame(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from parts import ALL, CAMERA, Points, frame_of
 
 from vslam.config import Config
 from vslam.frontend import initialization
+from vslam.method import starter as starter_module
 from vslam.method.starter import Starter, TwoViewStart
 from vslam.types.context import Context
 from vslam.types.geometry import se3_exp, se3_log, transform
@@ -48,7 +49,7 @@ def offered_twice(one: Starter, track: Track) -> TwoViewStart | None:
 def test_a_frame_with_enough_features_waits_for_a_second_view(n_features, enough):
     one = starter()
     assert one.offer(frame(0, 0.0, among=slice(0, n_features)), None) is None
-    assert one.is_waiting == enough
+    assert (offered_twice(one, frame(1, 0.5, 1.0)) is not None) == enough
 
 
 def test_two_views_from_different_places_begin_a_map():
@@ -174,6 +175,27 @@ def test_a_camera_that_only_turns_begins_no_map(seed):
         turned.features.xy[:] += 0.5 * rng.standard_normal(turned.features.xy.shape)
         turned.features.u_right[:] = np.nan
         assert one.offer(turned, None) is None
+
+
+def test_all_frames_since_the_image_was_dark_wait_for_the_map():
+    one = starter()
+    for k, n_features in enumerate([240, 0, 150, 240, 240]):
+        assert one.offer(frame(k, 0.1 * k, 1e-5 * k, slice(0, n_features)), None) is None
+    start = offered_twice(one, frame(5, 0.5, 1.0))
+    assert isinstance(start, TwoViewStart)
+    assert (start.first.index, start.second.index) == (3, 6)
+    assert [waiting.index for waiting in start.waiting] == [2, 4, 5]
+    assert all(waiting.extracted.pyramid is None for waiting in start.waiting)
+
+
+def test_the_oldest_frames_no_longer_wait_if_there_are_many(monkeypatch):
+    monkeypatch.setattr(starter_module, "_MAX_WAITING", 3)
+    one = starter()
+    for k in range(5):
+        assert one.offer(frame(k, 0.1 * k, 1e-5 * k), None) is None
+    start = offered_twice(one, frame(5, 0.5, 1.0))
+    assert isinstance(start, TwoViewStart)
+    assert [waiting.index for waiting in start.waiting] == [3, 4, 5]
 
 
 # -- the unit of a sub-map ------------------------------------------------------------------------

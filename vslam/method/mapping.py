@@ -118,11 +118,12 @@ class Mapper:
             published.refer_to(keyframe)
             return observe_keyframe(track, map_, keyframe) if len(new) else None
 
-    def begin(self, start: TwoViewStart) -> Track:
+    def begin(self, start: TwoViewStart) -> tuple[Track, Track]:
         """Begin a monocular map or sub-map with two keyframes. The second is the newest frame.
 
         Returns:
-            The second frame with its pose, its velocity and all landmarks of its keyframe.
+            The two frames with their poses, the velocity between them, and all landmarks of their
+            keyframes.
         """
         published = self.published
         published.complete()
@@ -134,8 +135,13 @@ class Mapper:
                 self._closing.process(map_, keyframe, track.features, image)
             published.frames.replace(start.first.index, keyframes[0])
             published.refer_to_new(keyframes[1], second)
+            first = observe_keyframe(start.first, map_, keyframes[0])
             second = observe_keyframe(second, map_, keyframes[1])
-        return replace(second, T_cw=published.frames.pose(second.index), twist=start.twist)
+        frames, twist = published.frames, start.twist
+        return (
+            replace(first, T_cw=frames.pose(first.index), twist=twist),
+            replace(second, T_cw=frames.pose(second.index), twist=twist),
+        )
 
     def rescale(self, scale: float, *tracks: Track) -> tuple[Track, ...]:
         """Make the metre the unit of the map, or of its newest sub-map if the map is metric. Return

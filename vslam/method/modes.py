@@ -13,7 +13,7 @@ from vslam.frontend.prediction import Prediction
 from vslam.frontend.tracker import Tracker
 from vslam.method.mapping import Mapper
 from vslam.method.published_map import PublishedMap
-from vslam.method.starter import Starter, TurnBetween
+from vslam.method.starter import Starter, TurnBetween, track_waiting
 from vslam.types.camera import Image
 from vslam.types.context import Context
 from vslam.types.geometry import inverse, orthonormalised, se3_log
@@ -150,9 +150,11 @@ class Building:
             return track
         (moved,) = self._published.complete(track)
         start = start.at_speed(moved.twist, _MAX_RESCALING)
-        track = self._mapper.begin(start)
+        first, second = self._mapper.begin(start)
+        for found in track_waiting(start, first, second, self._published.view, self._tracker):
+            self._published.frames.find(found.index, found.T_cw, beside=first.index)
         self.starter.reset()
-        return track
+        return second
 
     def map_far_points(self, last: Track | None) -> Track | None:
         if last is None or last.twist is not None or self._camera.monocular:
@@ -161,8 +163,11 @@ class Building:
 
     def update_map(self, track: Track, images: Images, predicted: Prediction) -> Track:
         if track.is_lost:
-            lost = self._is_lost_for_long(track, predicted)
-            return self.begin(track, images.image) if lost else track
+            if self._is_lost_for_long(track, predicted):
+                return self.begin(track, images.image)
+            if self._camera.monocular:
+                self.starter.wait(track)
+            return track
         self.starter.reset()
         self._published.count(track)
         evidence = self.policy.observe(

@@ -1,7 +1,8 @@
 """The start of a map, and the start of a sub-map after the camera was lost.
 
 A stereo or RGB-D map begins with one frame that has enough points. A monocular map needs two
-frames. The first frame is kept until a later frame forms a pair with it.
+frames. The first frame is kept until a later frame forms a pair with it. The poses of the frames
+that were offered meanwhile are found as soon as the map has begun.
 """
 
 from __future__ import annotations
@@ -13,16 +14,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.two_views import adjust_two_views
+from vslam.frontend.images import GivenFeatures
 from vslam.frontend.initialization import KnownTurn, match_views, reconstruct
+from vslam.frontend.prediction import Prediction
+from vslam.frontend.tracker import Tracker
 from vslam.types.camera import Image
 from vslam.types.context import Context
-from vslam.types.geometry import Matrix, se3_log, transform
+from vslam.types.features import Extracted
+from vslam.types.geometry import (
+    Matrix,
+    inverse,
+    orthonormalised,
+    se3_exp,
+    se3_log,
+    transform,
+)
+from vslam.types.map_view import MapView
 from vslam.types.track import Track
 
 # Two pairs of frames give the same scene if the ratios of the depths of at least _MIN_COMMON points
 # differ by at most this factor in the median, as a natural logarithm. In rendered halls, rooms and
 # towns, it was at most 0.24 for pairs whose translations are wrong by less than 8 degrees. [own]
 _MIN_COMMON, _MAX_SPREAD = 30, 0.3
+# At most this many frames wait for the map. Each takes about 0.1 MB, and 10 ms when the map begins.
+# [own]
+_MAX_WAITING = 300
 
 TurnBetween = Callable[[float, float], KnownTurn | None]
 
@@ -42,6 +58,8 @@ class TwoViewStart:
             first camera.
         predicted: whether the unit of the map was derived from the speed that the camera had before
             it was lost.
+        waiting: the other frames before the second frame that may show the same scene, in the order
+            of time. They are not tracked.
     """
 
     first: Track
@@ -51,6 +69,7 @@ class TwoViewStart:
     features: tuple[NDArray[np.int64], NDArray[np.int64]]
     points: Matrix
     predicted: bool = False
+    waiting: tuple[Track, ...] = ()
 
     @property
     def twist(self) -> Matrix:
@@ -112,15 +131,28 @@ class Starter:
         self._context, self._turn_between = context, turn_between
         self._first: tuple[Track, Image | None] | None = None
         self._start: TwoViewStart | None = None  # waits for a second pair
+        self._waiting: tuple[Track, ...] = ()
 
     @property
     def is_waiting(self) -> bool:
-        """Whether the first frame of a monocular map is waiting for a second frame."""
-        return self._first is not None
+        """Whether frames are waiting for a monocular map."""
+        return len(self._waiting) > 0
 
     def reset(self) -> None:
-        """Discard the waiting first frame of a monocular map, if there is one."""
+        """Discard all frames that are waiting for a monocular map."""
         self._first = self._start = None
+        self._waiting = ()
+
+    def wait(self, track: Track) -> None:
+        """Let a frame that was not tracked wait for a map, without trying to begin one.
+
+        A frame with so few features that no map can begin ends the wait of all earlier frames.
+        """
+        if len(track.features) < self._context.config.initialization.min_matches:
+            self._waiting = ()
+            return
+        features_only = Extracted(track.features)
+        self._waiting = (*self._waiting, replace(track, extracted=features_only))[-_MAX_WAITING:]
 
     def offer(self, track: Track, image: Image | None) -> TwoViewStart | None:
         """Try to begin a map with a frame that was not tracked and the earlier frame that was kept.
@@ -134,6 +166,15 @@ class Starter:
         Returns:
             The two frames with which the map begins, or None if it cannot begin yet.
         """
+        start = self._find_start(track, image)
+        if start is None:
+            self.wait(track)
+            return None
+        pair = start.first.index, start.second.index
+        waiting = tuple(one for one in self._waiting if one.index not in pair)
+        return replace(start, waiting=waiting)
+
+    def _find_start(self, track: Track, image: Image | None) -> TwoViewStart | None:
         config, second = self._context.config.initialization, (track, image)
         if self._first is None or track.timestamp - self._first[0].timestamp > config.max_seconds:
             self._keep(second)
@@ -190,3 +231,41 @@ class Starter:
         features = features[0][match], features[1][match]
         images = first[1], second[1]
         return TwoViewStart(first[0], second[0], images, T_2_1, features, points[kept])
+
+
+def track_waiting(
+    start: TwoViewStart, first: Track, second: Track, view: MapView, tracker: Tracker
+) -> list[Track]:
+    """Track the frames that waited for a map which has now begun.
+
+    The frames between the first and the second frame are tracked forwards in time, and those before
+    the first frame backwards.
+
+    Args:
+        first, second: the frames of the start, with their poses and landmarks in the map.
+        view: what tracking sees of this map.
+
+    Returns:
+        The frames that were tracked. The others show too little of the scene.
+    """
+    found = []
+    between = [one for one in start.waiting if one.index > first.index]
+    before = [one for one in reversed(start.waiting) if one.index < first.index]
+    for waiting in (between, before):
+        last, twist = first, start.twist
+        for one in waiting:
+            seconds = one.timestamp - last.timestamp
+            if one.index > first.index:
+                left = orthonormalised(second.T_cw @ inverse(last.T_cw))
+                twist = se3_log(left) / (second.timestamp - last.timestamp)
+            T_cw = orthonormalised(se3_exp(twist * seconds) @ last.T_cw)
+            predicted = Prediction(one.index, one.timestamp, T_cw, twist=twist, last=last)
+            images = GivenFeatures(one.extracted)
+            track = tracker.track_features(replace(one, T_cw=T_cw), images, predicted, view)
+            if track.is_lost:
+                twist = np.zeros(6)
+                continue
+            twist = se3_log(orthonormalised(track.T_cw @ inverse(last.T_cw))) / seconds
+            last = track
+            found.append(track)
+    return found

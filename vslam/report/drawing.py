@@ -30,7 +30,7 @@ VIOLET = "#8b5cf6"
 COMPARED = ("#ec4899", "#f97316", "#06b6d4")  # colours of the detectors of --compare
 STATE_COLORS = {
     TrackingState.WEAK: AMBER, TrackingState.INERTIAL: BLUE, TrackingState.LOST: RED,
-    TrackingState.DROPPED: VIOLET,
+    TrackingState.DROPPED: VIOLET, TrackingState.LATER: GREEN,
 }  # fmt: skip
 
 # Hex colour in the drawing -> CSS variable in the HTML report.

@@ -39,6 +39,7 @@ _COMPARED = (
     ("ATE", "ate_rmse_m", "{:.3f} m"),
     ("causal ATE", "causal_ate_rmse_m", "{:.3f} m"),
     ("RPE", "rpe_m", "{:.4f} m"),
+    ("RPE rotation", "rpe_deg", "{:.4f}°"),
     ("t_rel", "t_rel_percent", "{:.3f} %"),
     ("loops closed", "loops_closed", "{}"),
     ("loops found", "loops_found", "{}"),
@@ -70,7 +71,7 @@ def headlines(report: ReportJson) -> list[Tile]:
         Tile(
             "Lost frames",
             str(lost),
-            f"{share} {report.frames}{_before_map(report)}; {_carried(report)}"
+            f"{share} {report.frames}{_before_map(report)}; {_carried(report)}{_later(report)}"
             f"{report.weak_frames} weak, {report.skipped_frames} skipped, "
             f"{report.left_out_frames} left out",
             "bad" if lost else "good",
@@ -102,6 +103,10 @@ def headlines(report: ReportJson) -> list[Tile]:
 
 def _carried(report: ReportJson) -> str:
     return f"{count} carried by the IMU, " if (count := report.inertial_frames) else ""
+
+
+def _later(report: ReportJson) -> str:
+    return f"{count} found after the map began, " if (count := report.later_frames) else ""
 
 
 def _before_map(report: ReportJson) -> str:

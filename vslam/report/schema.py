@@ -275,6 +275,8 @@ class ReportJson(Measures, Document):
     - ``dropped_frames``: number of frames that were replaced by a newer frame in a real-time run.
     - ``lost_before_map``: number of lost frames before the first tracked frame. Only a run that
       begins a new map counts these frames.
+    - ``later_frames``: number of frames that were lost, and whose poses were found when a monocular
+      map began afterwards. They are no lost frames.
     - ``longest_loss_s``: longest time in seconds from a lost frame to the next tracked frame, or to
       the end.
     - ``warnings``: sentences about problems of the images or the rig that the run has detected,
@@ -299,6 +301,7 @@ class ReportJson(Measures, Document):
 
     lost_before_map: int = 0
     longest_loss_s: float | None = None
+    later_frames: int = 0
     weak_frames: int
     skipped_frames: int
     skipped_messages: list[str]

@@ -76,6 +76,7 @@ def summarize(
     return ReportJson(
         lost_before_map=_lost_before_map(outcome),
         longest_loss_s=_longest_loss_s(outcome.tracks),
+        later_frames=states[TrackingState.LATER],
         weak_frames=states[TrackingState.WEAK],
         skipped_frames=len(outcome.skipped),
         skipped_messages=outcome.skipped,

@@ -38,7 +38,8 @@ class RunOutcome:
         trajectory: final pose of every processed frame, including lost frames. If there is no
             complete map, these are the poses at the time of tracking.
         keyframes: final poses of the keyframes.
-        tracks: result of tracking each processed frame.
+        tracks: result of tracking each processed frame. The state of frames whose pose was found
+            after a monocular map began is LATER.
         warnings: problems of the images and of the stereo rig that the run detected, as sentences.
         skipped: a message for each frame whose images could not be read.
         n_left_out: number of images that the reader left out, because they have no partner or
@@ -126,7 +127,7 @@ class RunOutcome:
     @property
     def n_tracked(self) -> int:
         """Number of frames whose pose was determined from their images."""
-        found = (TrackingState.OK, TrackingState.WEAK)
+        found = (TrackingState.OK, TrackingState.WEAK, TrackingState.LATER)
         return sum(track.state in found for track in self.tracks)
 
     @cached_property

@@ -30,7 +30,7 @@ from vslam.support.errors import InputError
 from vslam.support.machine import peak_memory_mb, process_age
 from vslam.support.plugins import reason
 from vslam.types.camera import Camera
-from vslam.types.features import TrackResult
+from vslam.types.features import TrackingState, TrackResult
 from vslam.types.geometry import Matrix
 from vslam.types.loops import LoopCorrection, LoopEdge
 from vslam.types.map import Map
@@ -216,6 +216,7 @@ class SlamRun:
             outcome,
             trajectory=self.trajectory(),
             keyframes=slam.keyframe_trajectory(),
+            tracks=_with_found_later(self.tracks, slam.tracked()),
             warnings=[
                 *self._source_warnings(pair_warnings),
                 *slam.problems,
@@ -397,6 +398,15 @@ def _with_earlier(
         for one in before.corrections
     ]
     return loops + slam.loops, corrections + slam.corrections, np.concatenate([frames, extra])
+
+
+def _with_found_later(tracks: list[TrackResult], found: NDArray[np.bool_]) -> list[TrackResult]:
+    return [
+        replace(track, state=TrackingState.LATER)
+        if track.state == TrackingState.LOST and late
+        else track
+        for track, late in zip(tracks, found[: len(tracks)].tolist(), strict=True)
+    ]
 
 
 def _frames_of_this_run(map_: Map) -> NDArray[np.int64]:

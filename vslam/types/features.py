@@ -281,14 +281,17 @@ class TrackingState(StrEnum):
     OK: the pose has enough inliers. WEAK: the pose has few inliers. INERTIAL: the images gave no
     pose, and the IMU has carried the camera for at most three seconds. LOST: the pose is only
     predicted, or no map exists yet. DROPPED: the images arrived while earlier images were still
-    being processed (``--realtime``), so the pose is interpolated.
+    being processed (``--realtime``), so the pose is interpolated. LATER: the frame was LOST, and
+    its pose was found when a monocular map began afterwards. Only the results of a finished run
+    have this state.
     """
 
     OK = "OK"
     WEAK = "WEAK"
     LOST = "LOST"
     DROPPED = "DROPPED"
-    INERTIAL = "INERTIAL"  # last, because files number the states
+    INERTIAL = "INERTIAL"
+    LATER = "LATER"  # last, because files number the states
 
 
 @dataclass(frozen=True)

@@ -151,6 +151,13 @@ class FramePoses:
         self._frames.carried[self._number(index)] = False
         self._set(index, keyframe, np.eye(4), unit)
 
+    def find(self, index: int, T_cw: Matrix, *, beside: int) -> None:
+        """Store the pose ``T_cw`` of an earlier frame that had not been tracked. It is relative to
+        the keyframe of the frame ``beside``."""
+        self._frames.tracked[self._number(index)] = True
+        self._frames.carried[self._number(index)] = False
+        self.follow(index, int(self._frames.reference[self._number(beside)]), T_cw)
+
     def follow(self, index: int, keyframe: int, T_cw: Matrix) -> None:
         """Store the pose ``T_cw`` of a frame relative to a keyframe."""
         T_kw, unit = np.eye(4), 1.0

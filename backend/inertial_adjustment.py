@@ -28,9 +28,8 @@ from vslam.backend.bundle_adjustment import (
     step_cameras,
     step_points,
 )
-from vslam.backend.inertial_factor import Motions, add_factors, add_prior, stacked
-from vslam.backend.inertial_filter import FALL_AND_BIAS, inflated
-from vslam.backend.preintegration import preintegrate
+from vslam.backend.inertial_factor import Motions, add_factors, add_prior
+from vslam.backend.inertial_filter import FALL_AND_BIAS
 from vslam.types.geometry import Matrix, inverses
 from vslam.types.imu import InertialWindow
 
@@ -38,7 +37,6 @@ N_STATE = 9  # velocity and biases of a keyframe
 # The mean chi-square of the residuals of rotation, velocity and position per factor, of which each
 # has nine, above which samples and images do not agree. [own]
 MAX_MISFIT = 27.0
-LONGEST_S = 1.5  # s between two keyframes that a factor connects
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +46,6 @@ class InertialChain:
     Attributes:
         camera: ``(M,)`` int64, indices of the keyframes in the bundle problem.
         motions: the M - 1 motions between consecutive keyframes.
-        T_imu_camera: ``(4, 4)``, maps points of the camera to the IMU.
         gravity: ``(3,)`` expected acceleration of free fall in the world, m/s^2.
         bias: ``(6,)`` expected biases.
         information: ``(9, 9)`` inverse covariance of the expected gravity and biases.
@@ -56,7 +53,6 @@ class InertialChain:
 
     camera: NDArray[np.int64]
     motions: Motions
-    T_imu_camera: Matrix
     gravity: Matrix
     bias: Matrix
     information: Matrix
@@ -69,41 +65,31 @@ class InertialChain:
 
 def chain_of(
     window: InertialWindow,
+    motions: Motions,
     camera: NDArray[np.int64],
-    times: NDArray[np.float64],
     R_world_camera: Matrix,
 ) -> InertialChain | None:
-    """Connect keyframes by inertial factors. None if no two keyframes can be connected.
+    """Connect keyframes by inertial factors. None if the last motion is unknown.
 
-    The chain begins after the last gap between two keyframes, or of the samples.
+    The chain begins after the last unknown motion.
 
     Args:
-        camera: ``(M,)`` indices of keyframes in the bundle problem, in the order of time.
-        times: ``(M,)`` seconds.
+        motions: between M keyframes, in the order of time.
+        camera: ``(M,)`` indices of these keyframes in the bundle problem.
         R_world_camera: ``(3, 3)`` rotation of the last of these keyframes.
     """
-    noise, motions, state = inflated(window.noise), [], window.state
-    since = window.samples[0, 0] if len(window.samples) else np.inf
-    for k in range(len(times) - 1, 0, -1):
-        start, end = float(times[k - 1]), float(times[k])
-        if start < since or end - start > LONGEST_S:
-            break
-        motion = preintegrate(window.samples, start, end, noise, state.bias)
-        if motion.longest_gap > window.longest_gap:
-            break
-        motions.append(motion)
-    if not motions:
+    unknown = np.flatnonzero(motions.seconds == 0.0)
+    first = int(unknown[-1]) + 1 if len(unknown) else 0
+    if first == len(motions.seconds):
         return None
-    motions.reverse()
-    R_world_odom = R_world_camera @ window.R_odom_camera.T
+    state, R_world_odom = window.state, R_world_camera @ window.R_odom_camera.T
     to_world = np.eye(9)
     to_world[:3, :3] = R_world_odom
     covariance = state.covariance[FALL_AND_BIAS, FALL_AND_BIAS]
     expected = np.linalg.inv(to_world @ covariance @ to_world.T)
     return InertialChain(
-        camera[-len(motions) - 1 :],
-        stacked(motions, noise),
-        window.T_imu_camera,
+        camera[first:],
+        motions.some(slice(first, None)),
         R_world_odom @ state.gravity,
         state.bias,
         0.5 * (expected + expected.T),
@@ -195,7 +181,7 @@ def start_values(T_cw: Matrix, chain: InertialChain) -> Matrix:
     """Return ``(U,)`` gravity and the states of the keyframes, for given ``(K, 4, 4)`` poses."""
     g, motions = chain.gravity, chain.motions
     states = np.tile(np.r_[np.zeros(3), chain.bias], (len(chain.camera), 1))
-    poses = inverses(chain.T_imu_camera @ T_cw[chain.camera])
+    poses = inverses(motions.T_imu_camera[0] @ T_cw[chain.camera])
     R, t = poses[:-1, :3, :3], motions.seconds[:, None]
     moved = np.diff(poses[:, :3, 3], axis=0) - np.einsum("nij,nj->ni", R, motions.position)
     states[:-1, :3] = moved / t - 0.5 * t * g
@@ -216,7 +202,7 @@ def linear_factors(
     size = 6 * n_free + len(inertial)
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
     chi2, of_motion = add_factors(
-        chain.motions, chain.camera, T_cw, n_free, inertial, chain.T_imu_camera, hessian, gradient
+        chain.motions, chain.camera, T_cw, n_free, inertial, hessian, gradient
     )
     error = np.concatenate([inertial[:3] - chain.gravity, inertial[6:12] - chain.bias])
     chi2 += add_prior(error, chain.information, n_free, hessian, gradient)

@@ -16,10 +16,10 @@ world by ``R_wc (p_ci x phi - rho)``, where ``p_ci`` is the position of the IMU 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.backend.preintegration import (
     Preintegration,
@@ -32,7 +32,6 @@ from vslam.backend.preintegration import (
 )
 from vslam.support.kernels import inner_kernel, kernel
 from vslam.types.geometry import Matrix
-from vslam.types.imu import ImuNoise
 
 N_RESIDUALS = 15
 
@@ -142,50 +141,51 @@ def _factor(
 
 
 class Motions(NamedTuple):
-    """The motions between N + 1 consecutive keyframes, as an argument of kernels. The same biases
-    were subtracted from all of them.
+    """N motions between two keyframes each, as an argument of kernels.
 
     Attributes:
         seconds: ``(N,)``.
-        rotation, velocity, position, by_bias: ``(N, 3, 3)``, ``(N, 3)``, ``(N, 3)`` and
-            ``(N, 9, 6)``, see ``Preintegration``.
-        bias: ``(6,)`` biases that were subtracted.
+        rotation, velocity, position, bias, by_bias: ``(N, 3, 3)``, ``(N, 3)``, ``(N, 3)``,
+            ``(N, 6)`` and ``(N, 9, 6)``, see ``Preintegration``.
         information: ``(N, 15, 15)`` inverse covariances of the residuals.
+        T_imu_camera: ``(N, 4, 4)``, maps points of the camera to the IMU.
     """
 
     seconds: Matrix
     rotation: Matrix
     velocity: Matrix
     position: Matrix
-    by_bias: Matrix
     bias: Matrix
+    by_bias: Matrix
     information: Matrix
+    T_imu_camera: Matrix
+
+    def some(self, which: slice | NDArray[np.bool_]) -> Motions:
+        """Return some of these motions."""
+        return Motions._make(column[which] for column in self)
 
 
-def stacked(motions: Sequence[Preintegration], noise: ImuNoise) -> Motions:
-    """Stack motions, at least one, from which the same biases were subtracted.
-
-    Args:
-        noise: gives the random walks of the biases.
-    """
-    seconds = np.array([motion.seconds for motion in motions])
-    walks = np.square([*[noise.gyro_walk] * 3, *[noise.accel_walk] * 3])
-    information = np.zeros((len(motions), N_RESIDUALS, N_RESIDUALS))
-    information[:, :9, :9] = np.linalg.inv([motion.covariance for motion in motions])
-    information[:, range(9, 15), range(9, 15)] = 1.0 / (seconds[:, None] * walks)
-    return Motions(
-        seconds,
-        np.array([motion.rotation for motion in motions]),
-        np.array([motion.velocity for motion in motions]),
-        np.array([motion.position for motion in motions]),
-        np.array([motion.by_bias for motion in motions]),
-        motions[0].bias,
-        information,
+@inner_kernel
+def factor_of(motions, k, T_0w, T_1w, state_0, state_1, gravity):
+    """Compute the residuals of a motion and their derivatives (``inertial_factor``)."""
+    return _factor(
+        motions.seconds[k],
+        motions.rotation[k],
+        motions.velocity[k],
+        motions.position[k],
+        motions.bias[k],
+        motions.by_bias[k],
+        T_0w,
+        T_1w,
+        state_0,
+        state_1,
+        gravity,
+        motions.T_imu_camera[k],
     )
 
 
 @kernel
-def add_factors(motions, camera, T_cw, n_free, inertial, T_imu_camera, hessian, gradient):
+def add_factors(motions, camera, T_cw, n_free, inertial, hessian, gradient):
     """Add the inertial factors between consecutive keyframes to the normal equations.
 
     Args:
@@ -204,19 +204,14 @@ def add_factors(motions, camera, T_cw, n_free, inertial, T_imu_camera, hessian, 
     chi2, of_motion = 0.0, 0.0
     for k in range(len(motions.seconds)):
         first = 3 + 9 * k
-        r, J = _factor(
-            motions.seconds[k],
-            motions.rotation[k],
-            motions.velocity[k],
-            motions.position[k],
-            motions.bias,
-            motions.by_bias[k],
+        r, J = factor_of(
+            motions,
+            k,
             T_cw[camera[k]],
             T_cw[camera[k + 1]],
             inertial[first : first + 9],
             inertial[first + 9 : first + 18],
             gravity,
-            T_imu_camera,
         )
         for i in range(6):
             for end in range(2):
@@ -225,7 +220,7 @@ def add_factors(motions, camera, T_cw, n_free, inertial, T_imu_camera, hessian, 
             at[12 + i] = n_poses + first + i
         for i in range(3):
             at[30 + i] = n_poses + i
-        one, moved = _add_residuals(r, J, motions.information[k], at, hessian, gradient)
+        one, moved = add_residuals(r, J, motions.information[k], at, hessian, gradient)
         chi2 += one
         of_motion += moved
     return chi2, of_motion
@@ -241,12 +236,12 @@ def add_prior(error, information, n_free, hessian, gradient):
     """
     at = np.arange(6 * n_free, 6 * n_free + 9)
     at[3:] += 3  # the velocity is between gravity and the biases
-    chi2, _ = _add_residuals(error, np.eye(9), information, at, hessian, gradient)
+    chi2, _ = add_residuals(error, np.eye(9), information, at, hessian, gradient)
     return chi2
 
 
 @inner_kernel
-def _add_residuals(r, J, information, at, hessian, gradient):
+def add_residuals(r, J, information, at, hessian, gradient):
     """Add residuals to the normal equations.
 
     Args:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.fusion import fuse_neighbourhood
 from vslam.backend.inertial_adjustment import InertialChain, adjust_with_imu, chain_of
+from vslam.backend.keyframe_motions import forget_motion, motions_between, record_motion
 from vslam.backend.triangulation import triangulate_with_neighbours
 from vslam.config import Config
 from vslam.support.kernels import kernel
@@ -49,6 +50,8 @@ def map_keyframe(
     refresh_keyframe(map_, keyframe)
     fuse_neighbourhood(map_, keyframe, context)
     refresh_keyframe(map_, keyframe)
+    if inertial is not None:
+        record_motion(map_, keyframe, inertial)
     adjust_locally(map_, keyframe, context, inertial)
     cull_keyframes(map_, keyframe, context)
 
@@ -92,7 +95,7 @@ def adjust_locally(
     fail the chi-square test are removed.
 
     Args:
-        inertial: samples that connect the newest keyframes of the window; None without an IMU.
+        inertial: what is known from the IMU at the keyframe; None without an IMU.
     """
     config = context.config
     free, fixed, landmarks = local_window(map_, keyframe, config)
@@ -108,6 +111,8 @@ def adjust_locally(
         final = adjust_with_imu(
             refined, chain, iterations=iterations, use=coarse.inlier, tolerance=1e-3
         )
+        if final is None:
+            forget_motion(map_, keyframe)
     if final is None:
         final = adjust(refined, iterations=iterations, use=coarse.inlier, tolerance=1e-3)
     a = map_.arrays
@@ -139,8 +144,8 @@ def chain_in(
         if one in restarts or len(ids) == INERTIAL_KEYFRAMES:
             break
     ids.reverse()
-    R_world_camera = a.T_cw[keyframe, :3, :3].T
-    return chain_of(inertial, index[ids], map_.timestamps[ids], R_world_camera)
+    motions, R_world_camera = motions_between(map_, np.array(ids)), a.T_cw[keyframe, :3, :3].T
+    return chain_of(inertial, motions, index[ids], R_world_camera)
 
 
 def local_window(

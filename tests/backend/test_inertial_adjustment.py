@@ -17,11 +17,14 @@ from vslam.backend.inertial_adjustment import (
     linear_factors,
     start_values,
 )
-from vslam.backend.inertial_factor import inertial_factor, stacked
+from vslam.backend.inertial_factor import Motions, inertial_factor
+from vslam.backend.keyframe_motions import motions_between, record_motion
 from vslam.backend.preintegration import preintegrate, so3_exp, so3_log
 from vslam.types.camera import Camera
+from vslam.types.features import Features
 from vslam.types.geometry import inverse, se3_exp, transform
 from vslam.types.imu import InertialState, InertialWindow
+from vslam.types.map import Map
 
 CAMERA = Camera(400.0, 400.0, 320.0, 240.0, 0.1, 640, 480)
 T_IC = np.eye(4)
@@ -100,7 +103,7 @@ def test_the_cost_is_gtsams():
     expected = gtsam.ImuFactor(0, 2, 1, 3, 4, theirs).error(values)
     motion = preintegrate(rows, 1.0, 1.4, ADIS16448, BIAS)
     r, _ = inertial_factor(motion, *T, np.r_[v[0], BIAS], np.r_[v[1], BIAS], DOWN, T_IC)
-    ours = 0.5 * r @ stacked([motion], ADIS16448).information[0] @ r
+    ours = 0.5 * r[:9] @ np.linalg.inv(motion.covariance) @ r[:9]
     assert ours == pytest.approx(expected, rel=2e-3)
     assert expected > 100.0
 
@@ -152,9 +155,19 @@ def scene(
     return problem, truth[order], times
 
 
+def motions_at(times: np.ndarray, found: InertialWindow) -> Motions:
+    """Return the motions between keyframes at given times, as a map keeps them."""
+    map_ = Map(np.array([1.0, 1.2]))
+    for time in times:
+        map_.add_keyframe(Features.none(), np.eye(4), time, 0)
+    for keyframe in range(1, len(times)):
+        record_motion(map_, keyframe, found)
+    return motions_between(map_, np.arange(len(times)))
+
+
 def chain(problem: BundleProblem, times: np.ndarray, found: InertialWindow) -> InertialChain:
     n = problem.n_free
-    made = chain_of(found, np.r_[n, 0:n], times, np.eye(3))
+    made = chain_of(found, motions_at(times, found), np.r_[n, 0:n], np.eye(3))
     assert made is not None
     return made
 
@@ -217,17 +230,19 @@ def test_samples_that_contradict_the_images_are_not_used():
 
 def test_a_chain_begins_after_the_last_gap():
     rows, times = samples(), 0.5 + 0.3 * np.arange(8)
-    camera = np.arange(8)
-    assert chain_of(window(rows), camera, times, np.eye(3)).camera.tolist() == camera.tolist()
+
+    def chained(rows: np.ndarray, times: np.ndarray) -> list[int] | None:
+        found = window(rows)
+        made = chain_of(found, motions_at(times, found), np.arange(8), np.eye(3))
+        return None if made is None else made.camera.tolist()
+
+    assert chained(rows, times) == [*range(8)]
     gap = (rows[:, 0] > 1.2) & (rows[:, 0] < 1.35)
-    assert chain_of(window(rows[~gap]), camera, times, np.eye(3)).camera.tolist() == [3, 4, 5, 6, 7]
+    assert chained(rows[~gap], times) == [*range(3, 8)]
     late = times + np.where(np.arange(8) > 5, 1.3, 0.0)
-    assert chain_of(window(rows), camera, late, np.eye(3)).camera.tolist() == [6, 7]
-    assert chain_of(window(rows[rows[:, 0] > 1.0]), camera, times, np.eye(3)).camera.tolist() == [
-        2,
-        *range(3, 8),
-    ]
-    assert chain_of(window(rows[:0]), camera, times, np.eye(3)) is None
+    assert chained(rows, late) == [6, 7]
+    assert chained(rows[rows[:, 0] > 1.0], times) == [*range(2, 8)]
+    assert chained(rows[:0], times) is None
 
 
 def test_the_state_of_the_filter_is_turned_into_the_world():
@@ -237,7 +252,37 @@ def test_the_state_of_the_filter_is_turned_into_the_world():
     given, covariance = window(samples()), np.diag(SIGMAS**2)
     covariance[9:12, 9:12] = R @ sigmas @ R.T
     state = replace(given.state, gravity=R @ DOWN, covariance=covariance)
-    made = chain_of(replace(given, state=state, R_odom_camera=R), np.arange(3), times, np.eye(3))
+    turned = replace(given, state=state, R_odom_camera=R)
+    made = chain_of(turned, motions_at(times, given), np.arange(3), np.eye(3))
     assert made is not None
     np.testing.assert_allclose(made.gravity, DOWN, atol=1e-12)
     np.testing.assert_allclose(np.linalg.inv(made.information)[:3, :3], sigmas, atol=1e-12)
+
+
+def test_motions_around_a_culled_keyframe_are_one():
+    """The result is the motion that would have been integrated without the keyframe."""
+    times, found = 0.5 + 0.3 * np.arange(4), window(samples(ADIS16448))
+    map_ = Map(np.array([1.0, 1.2]))
+    for keyframe, time in enumerate(times):
+        map_.add_keyframe(Features.none(), np.eye(4), time, 0)
+        state = replace(found.state, bias=BIAS + 0.003 * keyframe)
+        record_motion(map_, keyframe, replace(found, state=state))
+    kept = motions_between(map_, np.array([0, 2, 3]))
+    direct = motions_at(times[[0, 2, 3]], window(samples(ADIS16448), bias=BIAS + 0.006))
+    assert kept.bias[0].tolist() == (BIAS + 0.006).tolist()
+    np.testing.assert_allclose(kept.seconds, [0.6, 0.3])
+    np.testing.assert_allclose(kept.rotation[0], direct.rotation[0], atol=1e-5)
+    np.testing.assert_allclose(kept.velocity[0], direct.velocity[0], atol=1e-4)
+    np.testing.assert_allclose(kept.position[0], direct.position[0], atol=1e-4)
+    np.testing.assert_allclose(kept.by_bias[0], direct.by_bias[0], atol=2e-3)
+    sigmas = [np.sqrt(np.diag(np.linalg.inv(m.information[0]))) for m in (kept, direct)]
+    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=0.02)
+    map_.keyframes.motion_seconds[1] = 0.0
+    assert motions_between(map_, np.array([0, 2, 3])).seconds.tolist() == [0.0, kept.seconds[1]]
+
+
+def test_a_motion_may_lie_between_two_samples():
+    """An IMU that is as slow as the camera has no sample between two keyframes."""
+    found = window(samples(rate=5.0), longest_gap=1.0)
+    made = motions_at(np.array([0.52, 0.58]), found)
+    assert (np.linalg.eigvalsh(made.information[0]) > 0.0).all()

@@ -32,11 +32,13 @@ N, PER = 7, 4  # keyframes, and keypoints of each
 # Columns that link keyframes, landmarks and rows. They are renumbered when a part of the map is
 # selected.
 FAMILY = {"parent", "restart"}
-LINKS = {"first_row", "first_keyframe", "keyframe", "landmark", "next_row", "head"}
+LINKS = {
+    "first_row", "first_keyframe", "keyframe", "landmark", "next_row", "head", "motion_seconds",
+}  # fmt: skip
 # Columns in which not every number is valid.
 RESTRICTED = FAMILY | LINKS | {
     "T_cw", "T_c_parent", "octave", "keyframe_alive", "landmark_alive", "fused_into",
-    "n_observations", "gravity",
+    "n_observations", "gravity", "motion_rotation", "motion_covariance", "T_imu_camera",
 }  # fmt: skip
 
 
@@ -74,6 +76,10 @@ def map_() -> Map:
     found.keyframes.T_c_parent[:N, 0, 3] = np.arange(1, N + 1)
     found.keyframes.restart[[3, 5]] = PREDICTED, UNPREDICTED
     found.keyframes.gravity[:N] = np.eye(3)[np.arange(N) % 3]
+    found.keyframes.motion_seconds[1:N] = np.arange(1, N)
+    found.keyframes.motion_rotation[:N] = np.eye(3)
+    found.keyframes.motion_covariance[:N] = np.arange(1, N + 1)[:, None, None] * np.eye(9)
+    found.keyframes.T_imu_camera[:N] = found.keyframes.T_c_parent[:N]
     names = vars(Scalars())
     found.scalars = Scalars(**{name: type(value)(N - 1) for name, value in names.items()})
     return found
@@ -119,6 +125,7 @@ def test_a_selection_has_all_of_what_is_selected(map_):
         assert_same({name: after[name] for name in names}, expected)
     assert after["parent"].tolist() == [-1, 0, 0, 1]
     assert after["restart"].tolist() == [0, 0, PREDICTED, UNPREDICTED]
+    assert after["motion_seconds"].tolist() == [0, 0, 3, 0]  # only keyframe 3 follows another
     assert found.scalars == replace(map_.scalars, calibrated_until=len(keyframes) - 1)
 
 

@@ -337,13 +337,13 @@ def test_foreign_files_are_refused(tmp_path):
 
 
 def test_other_schemas_are_named(file, tmp_path):
-    newer = as_header(header_of(file) | {"schema": 14})
-    assert "schema 14, but this version of vslam reads schema 13" in refusal(
+    newer = as_header(header_of(file) | {"schema": 15})
+    assert "schema 15, but this version of vslam reads schema 14" in refusal(
         changed(file, tmp_path / "n.npz", header=newer)
     )
     old = tmp_path / "old.npz"
     np.savez(old, schema=1, keyframe_first_row=np.zeros(1, np.int64))
-    assert "reads schema 13; make the map again" in refusal(old)
+    assert "reads schema 14; make the map again" in refusal(old)
 
 
 def damage(name: str, position: tuple[int, ...], value: float):
@@ -376,6 +376,8 @@ def mirror(file: Path, to: Path) -> Path:
         damage("keyframe_parent", (4,), -1),
         damage("keyframe_timestamp", (1,), np.inf),
         damage("keyframe_unit_scale", (1,), 0.0),
+        damage("keyframe_motion_seconds", (1,), -0.5),
+        damage("keyframe_motion_seconds", (1,), 0.5),  # the rest of the motion is zero
         damage("landmark_xyz", (7, 1), np.nan),
         damage("landmark_xyz", (7, 1), 1e200),
         damage("row_xy", (5, 0), 1e30),

@@ -83,6 +83,7 @@ ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "frame_carried": (np.bool_, ("F",)),
     "frame_unit_scale": (np.float64, ("F",)),
 }
+_OF_MOTIONS = ("T_imu_camera", *(name for name in KeyframeTable._fields if "motion" in name))
 _MAY_BE_NAN = {"row_u_right", "revisit_uvr", "loop_covariance"}
 _MOST = 1e12  # metres, pixels or seconds; the product of a few smaller numbers is finite
 _ROTATION_TOLERANCE = 1e-6
@@ -193,6 +194,7 @@ def _build_map(data: dict[str, NDArray], sizes: dict[str, int]) -> Map:
     known, length = sigma > 0.0, np.linalg.norm(direction, axis=1)
     is_unit = np.abs(length - known) < _ROTATION_TOLERANCE
     _require(bool((sigma >= 0.0).all() and is_unit.all()), "keyframe_gravity")
+    _check_motions({name: data[f"keyframe_{name}"] for name in _OF_MOTIONS})
     _check_ids("row_octave", data["row_octave"], len(scales))
     _require(bool((data["row_certainty"] > 0).all()), "row_certainty")
 
@@ -325,8 +327,27 @@ def _check_ids(name: str, ids: NDArray[np.integer], n: int, least: int = 0) -> N
 
 
 def _check_rigid(name: str, T: NDArray[np.float64]) -> None:
-    R = T[:, :3, :3]
-    error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0)
     last = np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0)
-    rigid = error < _ROTATION_TOLERANCE and last == 0.0 and (np.linalg.det(R) > 0.0).all()
+    rigid = _are_rotations(T[:, :3, :3]) and last == 0.0
     _require(bool(rigid), f"{name} is not a rigid motion")
+
+
+def _are_rotations(R: NDArray[np.float64]) -> bool:
+    error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0)
+    return bool(error < _ROTATION_TOLERANCE and (np.linalg.det(R) > 0.0).all())
+
+
+def _check_motions(table: dict[str, NDArray[np.float64]]) -> None:
+    """Check what an IMU measured between keyframes. The arrays are those of ``KeyframeTable``."""
+    seconds = table["motion_seconds"]
+    known = seconds > 0.0
+    _require(bool((seconds >= 0.0).all()), "keyframe_motion_seconds")
+    _require(_are_rotations(table["motion_rotation"][known]), "keyframe_motion_rotation")
+    _check_rigid("keyframe_T_imu_camera", table["T_imu_camera"][known])
+    covariance = table["motion_covariance"][known]
+    positive = (
+        np.array_equal(covariance, covariance.transpose(0, 2, 1))
+        and (np.linalg.eigvalsh(covariance)[:, :1] > 0.0).all()
+    )
+    _require(bool(positive), "keyframe_motion_covariance")
+    _require(bool((table["motion_walk"][known] > 0.0).all()), "keyframe_motion_walk")

@@ -165,8 +165,10 @@ def selected(map_: Map, keyframes: NDArray[np.int64], *, copy: bool = True) -> M
     all_kept = len(kept_rows) == map_.n_rows
     chosen_rows = slice(None) if all_kept and not copy else kept_rows
     parent, restart = _spanning_tree(map_, keyframes, new_id)
+    follows = np.r_[False, np.diff(keyframes) == 1]  # its motion began at a selected keyframe
     renumbered: dict[str, NDArray] = {
         "first_row": first_row,
+        "motion_seconds": np.where(follows, map_.keyframes.motion_seconds[keyframes], 0.0),
         "first_keyframe": anchor[kept].astype(np.int32),
         "keyframe": np.repeat(np.arange(n, dtype=np.int32), np.diff(first_row)),
         "parent": parent,

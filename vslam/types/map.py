@@ -126,6 +126,12 @@ class KeyframeTable(NamedTuple):
             It is zero if it was unknown when the keyframe was added.
         gravity_sigma: ``(K,)`` f8, standard deviation of ``gravity`` along each of the two axes
             across it, in radians. It is zero if ``gravity`` is unknown.
+        motion_seconds, motion_rotation, motion_velocity, motion_position, motion_bias,
+            motion_by_bias, motion_covariance: ``(K,)``, ``(K, 3, 3)``, ``(K, 3)``, ``(K, 3)``,
+            ``(K, 6)``, ``(K, 9, 6)`` and ``(K, 9, 9)`` f8, the motion of the IMU since the keyframe
+            before (``Preintegration``). All are zero if it is unknown.
+        motion_walk: ``(K, 6)`` f8, variances of the change of the biases in this time.
+        T_imu_camera: ``(K, 4, 4)`` f8, maps points of the camera to the IMU.
     """
 
     timestamp: NDArray[np.float64] = np.zeros(0)
@@ -137,6 +143,15 @@ class KeyframeTable(NamedTuple):
     restart: NDArray[np.uint8] = np.zeros(0, np.uint8)
     gravity: NDArray[np.float64] = np.zeros((0, 3))
     gravity_sigma: NDArray[np.float64] = np.zeros(0)
+    motion_seconds: NDArray[np.float64] = np.zeros(0)
+    motion_rotation: NDArray[np.float64] = np.zeros((0, 3, 3))
+    motion_velocity: NDArray[np.float64] = np.zeros((0, 3))
+    motion_position: NDArray[np.float64] = np.zeros((0, 3))
+    motion_bias: NDArray[np.float64] = np.zeros((0, 6))
+    motion_by_bias: NDArray[np.float64] = np.zeros((0, 9, 6))
+    motion_covariance: NDArray[np.float64] = np.zeros((0, 9, 9))
+    motion_walk: NDArray[np.float64] = np.zeros((0, 6))
+    T_imu_camera: NDArray[np.float64] = np.zeros((0, 4, 4))
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,20 @@
-"""Makes the camera of a rectified stereo pair from ``sensor_msgs/CameraInfo``, without ROS."""
+"""Makes the camera of a rectified stereo pair from ``sensor_msgs/CameraInfo``, and its pose on the
+robot from a parameter, without ROS."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from vslam import Camera
+from vslam.support.errors import InputError
+
+LOOKS_AHEAD = [0.0, 0.0, 0.0, -0.5, 0.5, -0.5, 0.5]
+"""The parameter ``base_to_camera`` of a camera at the origin of ``base_link`` that looks ahead."""
 
 
 def camera_of(left: Any, right: Any) -> Camera:
@@ -37,3 +45,23 @@ def camera_of(left: Any, right: Any) -> Camera:
         width=left.width,
         height=left.height,
     )
+
+
+def pose_of(numbers: Sequence[float]) -> NDArray[np.float64]:
+    """Return the ``(4, 4)`` transformation from the camera to ``base_link``.
+
+    Args:
+        numbers: x, y, z in metres, and the quaternion x, y, z, w, as ``tf2_echo base_link CAMERA``
+            prints them.
+
+    Raises:
+        InputError: these are not seven numbers, or the quaternion does not have length 1.
+    """
+    if len(numbers) != 7 or not abs(np.linalg.norm(numbers[3:]) - 1.0) < 0.01:
+        raise InputError(
+            f"base_to_camera {list(numbers)}: give x, y, z and a quaternion x, y, z, w of length 1."
+        )
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(numbers[3:]).as_matrix()
+    T[:3, 3] = numbers[:3]
+    return T

@@ -7,31 +7,38 @@ import time
 from collections import deque
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rclpy
-from camera import camera_of
+from camera import LOOKS_AHEAD, camera_of, pose_of
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from imu_input import LONGEST_WAIT_S, ImuInput
 from message_filters import ApproximateTimeSynchronizer, Subscriber
 from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, Image, Imu
 from tf2_msgs.msg import TFMessage
 
-from vslam import Slam
+from vslam import Camera, Slam
 from vslam.datasets.bag_messages import grey_of, levels_of_messages, stamp_of
 from vslam.datasets.grey_levels import Levels
+from vslam.datasets.image_files import read_grey
 from vslam.maps.ros import (
     FramePose,
+    Frames,
     odometry_message,
+    pose_message,
     static_tf_message,
     status_message,
     tf_message,
 )
 from vslam.support.errors import InputError
-from vslam.types.features import TrackResult
+from vslam.types.features import TrackingState, TrackResult
 
 TOPICS = {
     "left/image_rect": Image,
@@ -56,19 +63,37 @@ class SlamNode(Node):
     With an IMU, a pair waits until a sample that is not before it has come.
 
     Raises:
-        InputError: a parameter of the IMU is wrong.
+        InputError: a parameter is wrong, or the mask cannot be read.
     """
 
     def __init__(self) -> None:
         super().__init__("vslam")
         self.slam: Slam | None = None
         self.levels: Levels | None = None
+        self.mask: NDArray[np.uint8] | None = None
         self.before: FramePose | None = None
         self.said: set[str] = set()
-        self.detector = self.declare_parameter("detector", "both").value
-        self.map_file = self.declare_parameter("save_map", "").value
+        self.detector, self.map_file, self.first_map, mask, *names = (
+            self.declare_parameter(name, default).value
+            for name, default in (
+                ("detector", "both"),
+                ("save_map", ""),
+                ("load_map", ""),
+                ("mask", ""),
+                ("map_frame", "map"),
+                ("odom_frame", "odom"),
+                ("base_frame", "base_link"),
+            )
+        )
+        mounted = self.declare_parameter("base_to_camera", LOOKS_AHEAD).value
+        self.frames = Frames(*names, T_base_camera=pose_of(mounted))
+        self.localize = self.declare_parameter("localize", False).value
+        self.publishes_tf = self.declare_parameter("publish_tf", True).value
+        if mask:
+            self.mask = read_grey(Path(mask))
         self.imu = self.subscribe_to_imu()
         self.odometry = self.create_publisher(Odometry, "odom", 10)
+        self.pose = self.create_publisher(PoseWithCovarianceStamped, "pose", 10)
         self.tf = self.create_publisher(TFMessage, "/tf", 100)
         self.status = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -116,19 +141,30 @@ class SlamNode(Node):
         stamp = stamp_of(left)
         try:
             if self.slam is None:
-                imu = None if self.imu is None else self.imu.calibration(infos[0])
-                self.slam = Slam(camera_of(*infos), detector=self.detector, imu=imu)
-                self.static_tf.publish(static_tf_message(message_type, stamp))
+                self.slam = self.begin(camera_of(*infos), infos[0])
                 self.levels = levels_of_messages((left, right))
+                if self.publishes_tf:
+                    self.static_tf.publish(static_tf_message(message_type, stamp, self.frames))
             if self.imu is not None:
                 self.warn_once(*filter(None, [self.imu.complaint(stamp / 1e9)]))
                 self.slam.add_imu(self.imu.samples(stamp / 1e9))
             publish = partial(self.publish, stamp)
             images = (grey_of(image, self.levels) for image in (left, right))
-            self.slam.step(*images, stamp / 1e9, on_pose=publish)
+            self.slam.step(*images, stamp / 1e9, mask=self.mask, on_pose=publish)
             self.warn_once(*self.slam.problems)
         except ValueError as error:  # a wrong camera, or a clock that was set back
             self.get_logger().warning(f"a pair of images is left out: {error}")
+
+    def begin(self, camera: Camera, left: CameraInfo) -> Slam:
+        imu = None if self.imu is None else self.imu.calibration(left)
+        if not self.first_map:
+            return Slam(camera, detector=self.detector, imu=imu)
+        slam = Slam.load(self.first_map, localize=self.localize, imu=imu)
+        if slam.context.camera != camera:
+            raise ValueError(
+                f"{self.first_map} was made with another camera: {slam.context.camera}"
+            )
+        return slam
 
     def warn_once(self, *sentences: str) -> None:
         for sentence in sentences:
@@ -137,11 +173,20 @@ class SlamNode(Node):
         self.said.update(sentences)
 
     def publish(self, stamp: int, result: TrackResult) -> None:
-        """Publish the pose of a frame before the frame may become a keyframe."""
-        pose = FramePose.of(result, stamp)
-        self.odometry.publish(odometry_message(message_type, pose, self.before))
-        self.tf.publish(tf_message(message_type, pose))
-        self.status.publish(status_message(message_type, stamp, result))
+        """Publish the pose of a frame before the frame may become a keyframe.
+
+        Until the second frame of the map, the covariances are zero, which a filter would take for
+        certainty. A lost frame has no pose in the map.
+        """
+        pose, frames = FramePose.of(result, stamp), self.frames
+        is_known = pose.covariance is not None and pose.covariance.any()
+        if is_known:
+            self.odometry.publish(odometry_message(message_type, pose, self.before, frames))
+        if is_known and result.state != TrackingState.LOST:
+            self.pose.publish(pose_message(message_type, pose, frames))
+        if self.publishes_tf:
+            self.tf.publish(tf_message(message_type, pose, frames))
+        self.status.publish(status_message(message_type, stamp, result, frames))
         self.before = pose
 
     def close(self) -> None:
@@ -156,20 +201,20 @@ def main() -> None:
     rclpy.init()
     try:
         node = SlamNode()
+        try:
+            rclpy.spin(node)
+        except KeyboardInterrupt:
+            pass
+        finally:
+            try:
+                node.close()  # fails again if mapping has failed
+            finally:
+                node.destroy_node()
     except InputError as error:
-        rclpy.try_shutdown()
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    try:
-        rclpy.spin(node)
-    except KeyboardInterrupt:
-        pass
     finally:
-        try:
-            node.close()  # fails again if mapping has failed
-        finally:
-            node.destroy_node()
-            rclpy.try_shutdown()
+        rclpy.try_shutdown()
 
 
 if __name__ == "__main__":

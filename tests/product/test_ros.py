@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import runpy
 import shutil
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -27,6 +29,7 @@ from vslam.maps.ros import (
     T_BASE_OPTICAL,
     TOPICS,
     FramePose,
+    Frames,
     in_ros_axes,
     nanoseconds,
     odometry_message,
@@ -47,6 +50,7 @@ from vslam_lab.towns.inertial import samples_along
 ROOT = Path(__file__).parents[2]
 TRANSIENT_LOCAL = 1  # value in rmw's enum rmw_qos_durability_policy_t
 AHEAD = se3_exp(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+T_ROBOT_CAMERA = se3_exp(np.array([0.4, -0.2, 0.9, 0.0, 0.3, 0.0])) @ T_BASE_OPTICAL
 RIGHT_TURN = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.0]))
 
 
@@ -198,7 +202,8 @@ def test_the_axes_are_those_of_rep_103():
     assert not message.twist.covariance.any()
 
 
-def test_covariances_are_those_of_errors_in_the_axes_of_ros():
+@pytest.mark.parametrize("frames", [Frames(), Frames(T_base_camera=T_ROBOT_CAMERA)])
+def test_covariances_are_those_of_errors_in_the_axes_of_ros(frames):
     """Errors are drawn as ``vslam.types.odometry`` defines them, and measured as ROS defines them.
 
     Errors of position and rotation are in the axes of odom. Errors of velocity are in the axes of
@@ -211,17 +216,17 @@ def test_covariances_are_those_of_errors_in_the_axes_of_ros():
     T_2 = T_1 @ se3_exp(np.array([0.1, 0.0, 1.0, 0.0, 0.03, 0.0]))
     types = types_of_ros()
     poses = [FramePose.of(track(T, local), t) for T, t in ((T_1, 10**9), (T_2, 15 * 10**8))]
-    message = odometry_message(types, poses[1], poses[0])
+    message = odometry_message(types, poses[1], poses[0], frames)
     errors, velocities = [], []
     for one, two in rng.multivariate_normal(np.zeros(6), near, (4000, 2)):
         true = [
             FramePose(t, inverse(se3_exp(xi) @ inverse(T)), np.eye(4))
             for T, t, xi in ((T_1, 10**9, one), (T_2, 15 * 10**8, two))
         ]
-        T, estimate = true[1].T_odom_base, poses[1].T_odom_base
+        T, estimate = (frames.of_base(one.T_odom_camera) for one in (true[1], poses[1]))
         turn = Rotation.from_matrix(T[:3, :3] @ estimate[:3, :3].T).as_rotvec()
         errors.append([*(T[:3, 3] - estimate[:3, 3]), *turn])
-        twist = odometry_message(types, true[1], true[0]).twist.twist
+        twist = odometry_message(types, true[1], true[0], frames).twist.twist
         velocities.append(
             [getattr(part, axis) for part in (twist.linear, twist.angular) for axis in "xyz"]
         )
@@ -352,6 +357,7 @@ class FakeRos:
         self.published: dict[str, list] = {}
         self.subscribed: dict[str, tuple] = {}
         self.warnings: list[str] = []
+        self.declared: list[str] = []
         self.now = 0.0
         self.timers: list = []
         ros, types = self, types_of_ros()
@@ -361,6 +367,7 @@ class FakeRos:
                 assert name == "vslam"
 
             def declare_parameter(self, name: str, default: object) -> SimpleNamespace:
+                ros.declared.append(name)
                 return SimpleNamespace(value=parameters.get(name, default))
 
             def create_publisher(self, kind: type, topic: str, qos: object) -> SimpleNamespace:
@@ -534,16 +541,17 @@ def test_the_node_carries_the_camera_through_the_dark_with_the_samples_of_its_im
     for k, time in enumerate(corridor.timestamps[:n]):
         left, right = (np.uint8(k not in DARK) * one[k] for one in (corridor.left, corridor.right))
         wanted = slam.step(left, right, time, imu=feed.until(time))
-        sent = of_pose(ros.published["odom"][k].pose.pose)
+        sent = of_transform(ros.published["/tf"][k].transforms[1])
         assert wanted.T_odom_camera is not None
         np.testing.assert_allclose(sent, in_ros_axes(wanted.T_odom_camera), atol=1e-6)
     assert wanted.gravity is not None
     *_, level = ros.published["/tf"][-1].transforms
     assert (level.header.frame_id, level.child_frame_id) == ("level", "map")
-    gravity = ros.published["/diagnostics"][-1].status[0].values[1]
-    assert gravity.key == "gravity"
+    values = {one.key: one.value for one in ros.published["/diagnostics"][-1].status[0].values}
     np.testing.assert_allclose(
-        np.array(gravity.value.split(), float), T_BASE_OPTICAL[:3, :3] @ wanted.gravity, atol=1e-4
+        np.array(values["gravity"].split(), float),
+        T_BASE_OPTICAL[:3, :3] @ wanted.gravity,
+        atol=1e-4,
     )
 
 
@@ -578,18 +586,118 @@ def test_no_image_waits_for_an_imu_that_is_silent_and_the_node_says_so_once(
     assert len(ros.warnings) == 1
 
 
-def test_a_wrong_parameter_of_the_imu_is_refused(calibration, monkeypatch):
+def test_wrong_parameters_are_refused(calibration, monkeypatch):
     for parameters, said in (
         ({"imu_topics": "/imu"}, "calibration must name a file with T_imu_camera"),
         ({"imu_topics": "/a,/b,/c", "calibration": str(calibration)}, "give one topic, or those"),
+        ({"base_to_camera": [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]}, "give x, y, z and a quaternion"),
     ):
         with pytest.raises(InputError, match=said):
             FakeRos(parameters, monkeypatch)
 
 
+@pytest.mark.slow
+def test_poses_are_those_of_the_robot_and_go_on_without_a_jump_while_the_camera_is_lost(
+    corridor, monkeypatch
+):
+    quaternion = Rotation.from_matrix(T_ROBOT_CAMERA[:3, :3]).as_quat()
+    mounted = [*T_ROBOT_CAMERA[:3, 3].tolist(), *quaternion.tolist()]
+    parameters = {"detector": "none", "base_to_camera": mounted, "base_frame": "robot"}
+    ros = FakeRos(parameters, monkeypatch)
+    drive(ros, corridor, DARK)
+    n = len(corridor.timestamps)
+    assert ros.states() == ["LOST" if k in DARK else "OK" for k in range(n)]
+    ((static,),) = [message.transforms for message in ros.published["/tf_static"]]
+    assert (static.header.frame_id, static.child_frame_id) == ("robot", "camera_optical")
+    np.testing.assert_allclose(of_transform(static), T_ROBOT_CAMERA, atol=1e-12)
+
+    in_odom, in_map = [], []
+    for message in ros.published["/tf"]:
+        T_map_odom, T_odom_base = map(of_transform, message.transforms)
+        in_odom.append(T_odom_base)
+        in_map.append(T_map_odom @ T_odom_base)
+    robot = T_ROBOT_CAMERA @ corridor.T_wc @ inverse(T_ROBOT_CAMERA)
+    seen = [k for k in range(n) if k not in DARK]
+    np.testing.assert_allclose(np.array(in_map)[seen], robot[seen], atol=0.05)
+    steps = np.linalg.norm(np.diff(np.array(in_odom)[:, :3, 3], axis=0), axis=1)
+    assert steps.max() < 0.45  # the robot moves by 0.35 m per frame
+
+    odometry = ros.published["odom"]
+    assert [stamp(one.header) for one in odometry] == [
+        stamp(message.transforms[0].header) for message in ros.published["/tf"][1:]
+    ]
+    for one, before, now in zip(odometry, in_odom, in_odom[1:], strict=False):
+        assert (one.header.frame_id, one.child_frame_id) == ("odom", "robot")
+        np.testing.assert_allclose(of_pose(one.pose.pose), now, atol=1e-9)
+        ahead = (inverse(before) @ now)[0, 3] / 0.1
+        assert one.twist.twist.linear.x == pytest.approx(ahead, rel=0.05)
+        for covariance in (one.pose.covariance, one.twist.covariance):
+            assert np.linalg.eigvalsh(covariance.reshape(6, 6)).min() > 0.0
+    growth = [np.trace(one.pose.covariance.reshape(6, 6)) for one in odometry]
+    first, last = DARK[0] - 1, DARK[-1] - 1  # the first frame has no message
+    assert growth[first - 1] < growth[first] < growth[last]
+    assert growth[-1] > growth[first]  # odom does not return to the map
+    speeds = [np.trace(one.twist.covariance.reshape(6, 6)) for one in odometry]
+    assert min(speeds[first : last + 1]) > 10.0 * np.median(speeds[: first - 1])
+
+    poses = ros.published["pose"]
+    assert [stamp(one.header) for one in poses] == [
+        stamp(ros.published["/tf"][k].transforms[0].header) for k in seen[1:]
+    ]
+    np.testing.assert_allclose(of_pose(poses[-1].pose.pose), in_map[-1], atol=1e-9)
+    for one in poses:
+        assert np.linalg.eigvalsh(one.pose.covariance.reshape(6, 6)).min() > 0.0
+
+
+def test_nothing_is_sent_to_a_filter_before_the_second_frame_of_the_map(corridor, monkeypatch):
+    ros = FakeRos({"detector": "none"}, monkeypatch)
+    few = replace(corridor, left=corridor.left[:6], timestamps=corridor.timestamps[:6])
+    drive(ros, few, dark=range(3))
+    assert ros.states() == ["LOST"] * 3 + ["OK"] * 3
+    for topic in ("odom", "pose"):
+        first = ros.published[topic][0]
+        assert stamp(first.header) / 1e9 == pytest.approx(corridor.timestamps[4])
+        assert np.linalg.eigvalsh(first.pose.covariance.reshape(6, 6)).min() > 0.0
+
+
+@pytest.mark.slow
+def test_the_node_localises_in_the_map_of_an_earlier_drive_without_tf(
+    corridor, tmp_path, monkeypatch
+):
+    mask = np.full(corridor.left[0].shape, 255, np.uint8)
+    mask[-30:] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    given = {"mask": str(tmp_path / "mask.png"), "publish_tf": False}
+    saved = str(tmp_path / "map.npz")
+    first = FakeRos({"detector": "bow", "save_map": saved, **given}, monkeypatch)
+    drive(first, corridor)
+    frame = first.node.slam.frame
+    assert frame.features.xy[:, 1].max() < len(mask) - 30
+    first.node.close()
+    assert first.published["/tf"] == first.published["/tf_static"] == []
+
+    second = FakeRos({"load_map": saved, "localize": True, **given}, monkeypatch)
+    later = replace(
+        corridor,
+        **{name: getattr(corridor, name)[15:] for name in ("left", "right", "timestamps", "T_wc")},
+    )
+    drive(second, later)
+    assert second.warnings == []
+    assert set(second.states()[1:]) == {"OK"}
+    T_map_base = of_pose(second.published["pose"][-1].pose.pose)
+    np.testing.assert_allclose(T_map_base, in_ros_axes(corridor.T_wc[-1]), atol=0.05)
+    assert of_pose(second.published["odom"][-1].pose.pose)[0, 3] < 5.0  # since the second start
+
+    other = FakeRos({"load_map": saved, **given}, monkeypatch)
+    wide = replace(later, camera=replace(later.camera, fx=230.0))
+    drive(other, replace(wide, timestamps=later.timestamps[:1]))
+    assert "was made with another camera" in other.warnings[0]
+
+
 def test_the_node_leaves_ros_although_mapping_has_failed(monkeypatch):
     ros = ("rclpy.node", "rclpy.qos", "message_filters", "nav_msgs.msg", "sensor_msgs.msg",
-           "tf2_msgs.msg", "diagnostic_msgs.msg", "camera", "imu_input")  # fmt: skip
+           "tf2_msgs.msg", "diagnostic_msgs.msg", "geometry_msgs.msg", "camera",
+           "imu_input")  # fmt: skip
     for name in ros:
         monkeypatch.setitem(sys.modules, name, Mock(Node=object))
     monkeypatch.setitem(sys.modules, "rclpy", rclpy := Mock())
@@ -602,8 +710,27 @@ def test_the_node_leaves_ros_although_mapping_has_failed(monkeypatch):
     rclpy.try_shutdown.assert_called_once_with()
 
 
-def test_the_node_is_a_program_of_at_most_200_lines():
+def test_the_pages_name_the_parameters_and_topics_of_the_node(monkeypatch):
+    ros = FakeRos({}, monkeypatch)
+    readme = (ROOT / "examples" / "ros2" / "README.md").read_text()
+    table = readme[readme.index("| parameter |") :]
+    rows = [row.split("|")[1] for row in table[: table.index("\n\n")].splitlines()[2:]]
+    assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == set(ros.declared)
+    assert all(f"`{topic}`" in readme for topic in ros.published)
+
+    page = (ROOT / "docs" / "howto" / "nav2.md").read_text()
+    (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    for ekf in yaml.safe_load(text).values():
+        given = ekf["ros__parameters"]
+        inputs = {key: value for key, value in given.items() if re.fullmatch(r"\D+\d", key)}
+        assert {f"{name}_config" for name in inputs} == {key for key in given if "_config" in key}
+        assert set(inputs.values()) <= {"wheel/odometry", *ros.published}
+        assert all(len(given[f"{name}_config"]) == 15 for name in inputs)
+    assert set(re.findall(r"-p (\w+):=", page + readme)) <= set(ros.declared)
+
+
+def test_the_node_is_a_program_of_at_most_250_lines():
     """The node cannot be imported without ROS."""
     text = (ROOT / "examples" / "ros2" / "node.py").read_text()
     compile(text, "node.py", "exec")
-    assert len(text.splitlines()) <= 200
+    assert len(text.splitlines()) <= 250

@@ -3,8 +3,8 @@
 The frames follow REP 105: ``map`` -> ``odom`` -> ``base_link`` -> ``camera_optical``. Their axes
 follow REP 103. In ``map``, ``odom`` and ``base_link``, x points forward, y left and z up. In
 ``camera_optical``, x points right, y down and z forward, as everywhere else in vslam. ``base_link``
-is at the left camera. ``map`` and ``odom`` are at the first pose of ``base_link``. Lengths are in
-metres, or in the unit of a monocular map.
+is at the left camera, unless `Frames` places it elsewhere. ``map`` and ``odom`` are at the first
+pose of ``base_link``. Lengths are in metres, or in the unit of a monocular map.
 
 If an IMU has measured gravity, ``level`` -> ``map`` turns ``map`` until z points up. The turn
 has no other part, and ``map`` itself never turns.
@@ -17,7 +17,7 @@ are written with classes of the package rosbags. A ROS node uses the classes of 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -31,7 +31,7 @@ from vslam.types.features import TrackingState, TrackResult
 from vslam.types.geometry import Matrix, adjoint, inverse, inverses, se3_log
 from vslam.types.trajectory import Trajectory, quaternions
 
-LEVEL, MAP, ODOM, BASE, OPTICAL = "level", "map", "odom", "base_link", "camera_optical"
+LEVEL = "level"
 Types = Callable[[str], Any]
 
 T_BASE_OPTICAL = np.array(
@@ -49,6 +49,28 @@ TOPICS = {
     "/tf": ("tf2_msgs/msg/TFMessage", False),
     "/odom": ("nav_msgs/msg/Odometry", False),
 }
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """The names of the frames, and where the camera is on the robot.
+
+    Attributes:
+        map, odom, base, camera: names. ``camera`` is the frame of the rectified left camera.
+        T_base_camera: ``(4, 4)`` float64, maps points of ``camera`` to ``base``.
+    """
+
+    map: str = "map"
+    odom: str = "odom"
+    base: str = "base_link"
+    camera: str = "camera_optical"
+    T_base_camera: Matrix = field(default_factory=T_BASE_OPTICAL.copy)
+
+    def of_base(self, T: Matrix) -> Matrix:
+        """Convert a ``(4, 4)`` pose of the camera in its first frame to the pose of ``base`` in the
+        first frame of ``base``."""
+        pose: Matrix = self.T_base_camera @ T @ inverse(self.T_base_camera)
+        return pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +113,8 @@ class FramePose:
             result.gravity,
         )
 
-    @property
-    def T_odom_base(self) -> Matrix:
-        """``(4, 4)`` pose of ``base_link`` in ``odom``, with the axes of ROS."""
-        return in_ros_axes(self.T_odom_camera)
+
+_FRAMES = Frames()
 
 
 def in_ros_axes(T: Matrix) -> Matrix:
@@ -104,56 +124,78 @@ def in_ros_axes(T: Matrix) -> Matrix:
     return result
 
 
-def odometry_message(types: Types, pose: FramePose, before: FramePose | None) -> Any:
+def odometry_message(
+    types: Types, pose: FramePose, before: FramePose | None, frames: Frames = _FRAMES
+) -> Any:
     """Create ``nav_msgs/Odometry`` with the pose of ``base_link`` in the frame ``odom``.
 
     The velocity is in the axes of ``base_link``. It is the mean velocity since the earlier frame
     ``before``, or zero if ``before`` is None.
     """
-    twist, R = np.zeros(6), T_BASE_OPTICAL[:3, :3]
+    T_odom_base, twist, A = frames.of_base(pose.T_odom_camera), np.zeros(6), _adjoint(frames)
     if before is not None:
-        motion = inverse(before.T_odom_base) @ pose.T_odom_base
+        motion = inverse(frames.of_base(before.T_odom_camera)) @ T_odom_base
         twist = se3_log(motion) / _seconds_between(before, pose)
     linear, angular = (_xyz(types, "Vector3", part) for part in (twist[:3], twist[3:]))
     return types("nav_msgs/msg/Odometry")(
-        header=_header(types, pose.stamp, ODOM),
-        child_frame_id=BASE,
+        header=_header(types, pose.stamp, frames.odom),
+        child_frame_id=frames.base,
         pose=types("geometry_msgs/msg/PoseWithCovariance")(
-            pose=_pose(types, pose.T_odom_base),
-            covariance=_covariance(pose.covariance, R @ pose.T_odom_camera[:3, :3]),
+            pose=_pose(types, T_odom_base),
+            covariance=_covariance(pose.covariance, _both(T_odom_base[:3, :3]) @ A),
         ),
         twist=types("geometry_msgs/msg/TwistWithCovariance")(
             twist=types("geometry_msgs/msg/Twist")(linear=linear, angular=angular),
-            covariance=_covariance(_velocity_covariance(pose, before), R),
+            covariance=_covariance(_velocity_covariance(pose, before), A),
         ),
     )
 
 
-def tf_message(types: Types, pose: FramePose) -> Any:
+def pose_message(types: Types, pose: FramePose, frames: Frames = _FRAMES) -> Any:
+    """Create ``geometry_msgs/PoseWithCovarianceStamped`` with the pose of ``base_link`` in the
+    frame ``map``.
+
+    Its covariance is that of the odometry, which does not know that loops reduce the error.
+    """
+    T_map_base = frames.of_base(pose.T_map_odom @ pose.T_odom_camera)
+    return types("geometry_msgs/msg/PoseWithCovarianceStamped")(
+        header=_header(types, pose.stamp, frames.map),
+        pose=types("geometry_msgs/msg/PoseWithCovariance")(
+            pose=_pose(types, T_map_base),
+            covariance=_covariance(pose.covariance, _both(T_map_base[:3, :3]) @ _adjoint(frames)),
+        ),
+    )
+
+
+def tf_message(types: Types, pose: FramePose, frames: Frames = _FRAMES) -> Any:
     """Create ``tf2_msgs/TFMessage`` with ``map`` -> ``odom`` and ``odom`` -> ``base_link``, and
     with ``level`` -> ``map`` if gravity is known."""
+    names, T_map_odom = (frames.map, frames.odom), frames.of_base(pose.T_map_odom)
+    T_odom_base = frames.of_base(pose.T_odom_camera)
     transforms = [
-        _transform(types, pose.stamp, MAP, ODOM, in_ros_axes(pose.T_map_odom)),
-        _transform(types, pose.stamp, ODOM, BASE, pose.T_odom_base),
+        _transform(types, pose.stamp, *names, T_map_odom),
+        _transform(types, pose.stamp, frames.odom, frames.base, T_odom_base),
     ]
     if pose.gravity is not None:
-        T_level_map = level_world(pose.gravity, T_BASE_OPTICAL) @ T_BASE_OPTICAL.T
-        transforms.append(_transform(types, pose.stamp, LEVEL, MAP, T_level_map))
+        T_base_camera = np.eye(4)
+        T_base_camera[:3, :3] = frames.T_base_camera[:3, :3]
+        T_level_map = level_world(pose.gravity, T_base_camera) @ T_base_camera.T
+        transforms.append(_transform(types, pose.stamp, LEVEL, frames.map, T_level_map))
     return types("tf2_msgs/msg/TFMessage")(transforms=transforms)
 
 
-def static_tf_message(types: Types, stamp: int) -> Any:
+def static_tf_message(types: Types, stamp: int, frames: Frames = _FRAMES) -> Any:
     """Create ``tf2_msgs/TFMessage`` with ``base_link`` -> ``camera_optical``."""
-    transform = _transform(types, stamp, BASE, OPTICAL, T_BASE_OPTICAL)
+    transform = _transform(types, stamp, frames.base, frames.camera, frames.T_base_camera)
     return types("tf2_msgs/msg/TFMessage")(transforms=[transform])
 
 
-def status_message(types: Types, stamp: int, result: TrackResult) -> Any:
+def status_message(types: Types, stamp: int, result: TrackResult, frames: Frames = _FRAMES) -> Any:
     """Create ``diagnostic_msgs/DiagnosticArray`` with the state of a frame as its message.
 
     Its level is OK if the images gave a pose with enough inliers, ERROR if the pose is only
-    predicted, and WARN otherwise. Its values are the number of inliers, and gravity along the axes
-    of ``map`` in m/s^2, or "unknown".
+    predicted, and WARN otherwise. Its values are the number of inliers, the part of the map
+    (``TrackResult.part``), and gravity along the axes of ``map`` in m/s^2, or "unknown".
 
     Args:
         stamp: time of the image in nanoseconds.
@@ -164,12 +206,11 @@ def status_message(types: Types, stamp: int, result: TrackResult) -> Any:
         TrackingState.LOST: status.ERROR,
         TrackingState.DROPPED: status.ERROR,
     }.get(result.state, status.WARN)
-    known = result.gravity is not None
-    gravity = T_BASE_OPTICAL[:3, :3] @ result.gravity if known else ()
-    values = {
-        "inliers": str(result.n_inliers),
-        "gravity": " ".join(f"{one:.4f}" for one in gravity) if known else "unknown",
-    }
+    gravity = "unknown"
+    if result.gravity is not None:
+        xyz = frames.T_base_camera[:3, :3] @ result.gravity
+        gravity = " ".join(f"{one:.4f}" for one in xyz)
+    values = {"inliers": str(result.n_inliers), "part": str(result.part), "gravity": gravity}
     pair = types("diagnostic_msgs/msg/KeyValue")
     return types("diagnostic_msgs/msg/DiagnosticArray")(
         header=_header(types, stamp, ""),
@@ -190,11 +231,11 @@ def path_message(types: Types, trajectory: Trajectory) -> Any:
     stamps = [nanoseconds(timestamp) for timestamp in trajectory.timestamps.tolist()]
     poses = [
         types("geometry_msgs/msg/PoseStamped")(
-            header=_header(types, stamp, MAP), pose=_pose(types, T)
+            header=_header(types, stamp, _FRAMES.map), pose=_pose(types, T)
         )
         for stamp, T in zip(stamps, in_ros_axes(trajectory.T_wc), strict=True)
     ]
-    return types("nav_msgs/msg/Path")(header=_header(types, stamps[0], MAP), poses=poses)
+    return types("nav_msgs/msg/Path")(header=_header(types, stamps[0], _FRAMES.map), poses=poses)
 
 
 def points_message(types: Types, stamp: int, xyz: NDArray[np.float64]) -> Any:
@@ -206,7 +247,7 @@ def points_message(types: Types, stamp: int, xyz: NDArray[np.float64]) -> Any:
         for k, name in enumerate("xyz")
     ]
     return types("sensor_msgs/msg/PointCloud2")(
-        header=_header(types, stamp, MAP),
+        header=_header(types, stamp, _FRAMES.map),
         height=1,
         width=len(points),
         fields=fields,
@@ -322,17 +363,28 @@ def frame_poses(
     return found
 
 
-def _covariance(matrix: Matrix | None, R: Matrix) -> NDArray[np.float64]:
-    """Rotate the axes of a covariance of ``[x, y, z, rx, ry, rz]`` by ``R``. Returns ``(36,)``, row
-    by row.
+def _covariance(matrix: Matrix | None, A: Matrix) -> NDArray[np.float64]:
+    """Return the covariance of the errors ``A xi``, as ``(36,)`` row by row, from the covariance of
+    the errors ``xi = [x, y, z, rx, ry, rz]``.
 
     An unknown covariance (None) becomes all zeros, which is the convention of ``sensor_msgs``.
     """
     if matrix is None:
         return np.zeros(36)
-    both = np.kron(np.eye(2), R)
-    rotated: NDArray[np.float64] = (both @ matrix @ both.T).ravel()
-    return rotated
+    moved: NDArray[np.float64] = (A @ matrix @ A.T).ravel()
+    return moved
+
+
+def _both(R: Matrix) -> Matrix:
+    """Return the ``(6, 6)`` matrix that rotates ``[v, w]`` by ``R``."""
+    both = np.zeros((6, 6))
+    both[:3, :3] = both[3:, 3:] = R
+    return both
+
+
+def _adjoint(frames: Frames) -> Matrix:
+    """Return the ``(6, 6)`` matrix that moves a twist from the camera to ``base_link``."""
+    return adjoint(frames.T_base_camera)
 
 
 def _velocity_covariance(pose: FramePose, before: FramePose | None) -> Matrix | None:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.backend.inertial_factor import InertialLinks
 from vslam.support.kernels import inner_kernel, kernel
 from vslam.types.geometry import compose, orthonormalised, se3_exp
 from vslam.types.reprojection import chi_square, residual, unpacked
@@ -39,6 +40,8 @@ class BundleProblem:
             standard deviation of the disparity; None uses the ratio in ``intrinsics``.
         gravity, gravity_sigma: ``(K, 3)`` and ``(K,)``, see ``PoseGraph``; None if gravity is
             unknown. Only global bundle adjustment uses them.
+        links: inertial factors between keyframes; None if there are none. Only global bundle
+            adjustment uses them.
     """
 
     T_cw: NDArray[np.float64]
@@ -52,6 +55,7 @@ class BundleProblem:
     disparity_weight: NDArray[np.float64] | None = None
     gravity: NDArray[np.float64] | None = None
     gravity_sigma: NDArray[np.float64] | None = None
+    links: InertialLinks | None = None
 
     def disparity_weights(self) -> NDArray[np.float64]:
         """Return ``(O,)`` float64: ``disparity_weight``, or the ratio in ``intrinsics`` if it is

@@ -27,6 +27,8 @@ from vslam.backend.bundle_adjustment import (
     step_cameras,
     step_points,
 )
+from vslam.backend.inertial_adjustment import MAX_MISFIT
+from vslam.backend.inertial_links import LinkedStates
 from vslam.support.kernels import inner_kernel, kernel
 
 
@@ -46,9 +48,28 @@ def adjust_globally(
         tolerance: the optimisation stops when an iteration reduces the cost by a smaller fraction
             than this.
         stop: called before each iteration. If it returns True, the current estimate is returned.
+
+    Inertial factors that do not agree with the images are not used.
     """
-    n_free, n_observations = problem.n_free, len(problem.camera)
+    if problem.links is not None:
+        solution, misfit = _adjusted(problem, iterations, tolerance, stop)
+        if misfit <= MAX_MISFIT:
+            return solution
+    return _adjusted(replace(problem, links=None), iterations, tolerance, stop)[0]
+
+
+def _adjusted(
+    problem: BundleProblem, iterations: int, tolerance: float, stop: Callable[[], bool] | None
+) -> tuple[BundleSolution, float]:
+    """Do what ``adjust_globally`` does. Also return the misfit of the inertial factors."""
+    n_cameras, n_observations, states = problem.n_free, len(problem.camera), None
+    if problem.links is not None:
+        states = LinkedStates.of(problem.links, problem.T_cw, n_cameras)
+        problem = _with_states(problem, states)
+    n_free = problem.n_free
     pairs = coupled_cameras(problem.first, problem.camera, n_free)
+    if states is not None:
+        pairs = np.concatenate([pairs, states.pairs])
     structure = analyse(n_free, pairs)
     # The free cameras in elimination order, followed by the fixed cameras.
     cameras = np.concatenate([structure.order, np.arange(n_free, len(problem.T_cw))])
@@ -69,6 +90,11 @@ def adjust_globally(
     inlier = np.ones(n_observations, np.bool_)
     level = _Level.of(problem, cameras)
     cost = robust_cost(T_cw, points, observations, inlier) + level.cost(T_cw)
+    values, values_trial = np.empty((n_free, 6)), np.empty((n_free, 6))
+    if states is not None:
+        states = states.in_order(structure.order, rank)
+        values = states.start
+        cost += states.cost(T_cw, values)
     equations = empty_equations(n_free, len(points), n_observations)
     S, x = np.empty(36 * len(structure.row)), np.empty((n_free, 6))
     V_inverse = np.empty((len(points), 3, 3))
@@ -81,22 +107,30 @@ def adjust_globally(
         cost += level.cost(T_cw)
         linearise(T_cw, n_free, points, observations, equations)
         level.add_to(equations, T_cw)
+        if states is not None:
+            states.linearise(T_cw, values)
         improved, small = False, False
         for _ in range(8):
             reduce_points_sparsely(
                 structure, slots, n_free, observations, equations, damping, S, x, V_inverse
             )
+            if states is not None:
+                states.add_to(structure, values, damping, S, x)
             if factor_solve(structure, S, x):
                 step = x.reshape(-1)
                 step_points(n_free, observations, equations, step, V_inverse, points, points_trial)
                 step_cameras(n_free, step, T_cw, T_trial)
                 trial = robust_cost(T_trial, points_trial, observations, inlier)
                 trial += level.cost(T_trial)
+                if states is not None:
+                    values_trial = values + x
+                    trial += states.cost(T_trial, values_trial)
                 if trial < cost:
                     small = cost - trial < tolerance * cost
                     cost = trial
                     T_cw, T_trial = T_trial, T_cw
                     points, points_trial = points_trial, points
+                    values, values_trial = values_trial, values
                     damping, growth, improved = max(damping * 0.1, 1e-9), 2.0, True
                     break
             damping *= growth * 5.0
@@ -108,7 +142,32 @@ def adjust_globally(
     points_trial[points_order] = points
     inlier_unsorted = np.empty_like(inlier)
     inlier_unsorted[order] = inlier
-    return BundleSolution(T_cw[rank], points_trial, cost, inlier_unsorted, done)
+    misfit = 0.0 if states is None else states.misfit(T_cw, values)
+    T_cw = np.delete(T_cw[rank], np.s_[n_cameras:n_free], axis=0)
+    return BundleSolution(T_cw, points_trial, cost, inlier_unsorted, done), misfit
+
+
+def _with_states(problem: BundleProblem, states: LinkedStates) -> BundleProblem:
+    """Add one camera, which observes nothing, for each block of states. Where gravity is an
+    unknown, what a keyframe sensed of it is left out, because it is part of the samples."""
+    n, added = problem.n_free, len(states.start) - problem.n_free
+
+    def widened(array: NDArray[np.float64], value: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.concatenate([array[:n], np.broadcast_to(value, (added, *value.shape)), array[n:]])
+
+    gravity, sigma = problem.gravity, problem.gravity_sigma
+    if gravity is not None and sigma is not None and problem.links is not None:
+        sigma = sigma.copy()
+        sigma[problem.links.first] = sigma[problem.links.last] = 0.0
+        gravity, sigma = widened(gravity, np.zeros(3)), widened(sigma, np.zeros(()))
+    return replace(
+        problem,
+        T_cw=widened(problem.T_cw, np.eye(4)),
+        n_free=n + added,
+        camera=np.where(problem.camera < n, problem.camera, problem.camera + added),
+        gravity=gravity,
+        gravity_sigma=sigma,
+    )
 
 
 @dataclass(frozen=True)

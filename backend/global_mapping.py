@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 
 from vslam.backend.bundle_adjustment import BundleProblem, BundleSolution
 from vslam.backend.gravity import gravity_at
+from vslam.backend.inertial_factor import InertialLinks
+from vslam.backend.keyframe_motions import motions_between
 from vslam.backend.local_mapping import assemble
 from vslam.backend.loop_correction import carry_landmarks
 from vslam.support.kernels import kernel
 from vslam.types.camera import DISPARITY_WEIGHT, Camera
 from vslam.types.geometry import compose, inverse, orthonormalised
+from vslam.types.imu import GRAVITY
 from vslam.types.map import Map
 from vslam.types.map_kernels import refresh_landmarks, resolve, unlink
 
@@ -53,7 +56,7 @@ def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
     The first keyframe of each connected part of the map is held fixed, because nothing else
     determines the position of this part. Two keyframes are connected if they observe a common
     landmark. In the part of the first keyframe, gravity has the same direction everywhere, where an
-    IMU has measured it.
+    IMU has measured it, and the motions of the IMU connect consecutive keyframes.
     """
     living = map_.living_keyframes()
     landmarks = map_.living_landmarks().astype(np.int32)
@@ -70,10 +73,38 @@ def take_snapshot(map_: Map, camera: Camera) -> GlobalSnapshot:
     if sigma.any():
         unknown = np.zeros((n_revisits, 3))
         gravity, sigma = np.concatenate([unknown, gravity]), np.r_[unknown[:, 0], sigma]
-        problem = replace(problem, gravity=gravity, gravity_sigma=sigma)
+        links = _links(map_, n_revisits + np.argsort(keyframes), part, gravity, sigma)
+        problem = replace(problem, gravity=gravity, gravity_sigma=sigma, links=links)
     return GlobalSnapshot(
         problem, keyframes, landmarks, rows, map_.n_keyframes, map_.n_landmarks, n_revisits
     )
+
+
+def _links(
+    map_: Map,
+    camera: NDArray[np.int64],
+    part: NDArray[np.int64],
+    gravity: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+) -> InertialLinks | None:
+    """Connect the keyframes of the part of the first keyframe by the motions of the IMU.
+
+    Args:
+        camera: ``(K,)`` indices of the living keyframes, in the order of their ids.
+        part: see ``connected_parts``.
+        gravity, sigma: see ``BundleProblem``.
+    """
+    living = map_.living_keyframes()
+    motions = motions_between(map_, living)
+    usable = part[living] == part[living[0]]
+    known = (motions.seconds > 0.0) & usable[:-1] & usable[1:]
+    if not known.any():
+        return None
+    felt = sigma[camera] > 0.0
+    R_cw, weight = map_.arrays.T_cw[living[felt], :3, :3], sigma[camera[felt]] ** -2.0
+    down = np.einsum("n,nji,nj->i", weight, R_cw, gravity[camera[felt]])
+    down *= GRAVITY / np.linalg.norm(down)
+    return InertialLinks(camera[:-1][known], camera[1:][known], motions.some(known), down)
 
 
 def _with_revisits(

@@ -16,6 +16,7 @@ world by ``R_wc (p_ci x phi - rho)``, where ``p_ci`` is the position of the IMU 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -163,6 +164,23 @@ class Motions(NamedTuple):
     def some(self, which: slice | NDArray[np.bool_]) -> Motions:
         """Return some of these motions."""
         return Motions._make(column[which] for column in self)
+
+
+@dataclass(frozen=True, eq=False)
+class InertialLinks:
+    """Motions between keyframes of a bundle problem.
+
+    Attributes:
+        first, last: ``(N,)`` int64 indices of the keyframes at both ends of each motion. A keyframe
+            is the first one, and the last one, of at most one motion.
+        motions: the motions.
+        gravity: ``(3,)`` start value of the acceleration of free fall in the world, m/s^2.
+    """
+
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    motions: Motions
+    gravity: Matrix
 
 
 @inner_kernel

@@ -188,3 +188,23 @@ def test_outliers_go_unless_the_row_observes_something_else_by_now(check_map):
     check_map(map_)
     link_many(a, snapshot.rows[[gone]], observed[[gone]])  # the row is free and usable
     check_map(map_)
+
+
+def test_a_snapshot_links_consecutive_keyframes_by_the_motions_of_the_imu():
+    world = world_of(7)
+    map_, table = world.map, world.map.keyframes
+    assert take_snapshot(map_, CAMERA).problem.links is None
+    table.gravity[:7], table.gravity_sigma[:7] = [0.0, 0.8, 0.6], 0.01
+    known = np.array([1, 2, 3, 5, 6])
+    table.motion_seconds[known] = 0.1 * known
+    table.motion_rotation[:7] = np.eye(3)
+    table.motion_covariance[:7], table.motion_walk[:7] = np.eye(9), 1.0
+    map_.cull_keyframe(2)
+    snapshot = take_snapshot(map_, CAMERA)
+    links = snapshot.problem.links
+    assert snapshot.keyframes[links.first].tolist() == [0, 1, 4, 5]
+    assert snapshot.keyframes[links.last].tolist() == [1, 3, 5, 6]
+    np.testing.assert_allclose(links.motions.seconds, [0.1, 0.5, 0.5, 0.6])
+    map_.cull_keyframe(4)  # the motion before it is unknown
+    snapshot = take_snapshot(map_, CAMERA)
+    assert snapshot.keyframes[snapshot.problem.links.last].tolist() == [1, 3, 6]

@@ -10,6 +10,7 @@ import pytest
 
 from tests.inertial import ADIS16448, DOWN, Flight
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
+from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.inertial_adjustment import (
     InertialChain,
     adjust_with_imu,
@@ -17,7 +18,9 @@ from vslam.backend.inertial_adjustment import (
     linear_factors,
     start_values,
 )
-from vslam.backend.inertial_factor import Motions, inertial_factor
+from vslam.backend.inertial_factor import InertialLinks, Motions, inertial_factor
+from vslam.backend.inertial_links import GRAVITY_SIGMA
+from vslam.backend.inertial_start import ACCEL_BIAS, GYRO_BIAS
 from vslam.backend.keyframe_motions import motions_between, record_motion
 from vslam.backend.preintegration import preintegrate, so3_exp, so3_log
 from vslam.types.camera import Camera
@@ -286,3 +289,42 @@ def test_a_motion_may_lie_between_two_samples():
     found = window(samples(rate=5.0), longest_gap=1.0)
     made = motions_at(np.array([0.52, 0.58]), found)
     assert (np.linalg.eigvalsh(made.information[0]) > 0.0).all()
+
+
+def linked(problem: BundleProblem, times: np.ndarray, found: InertialWindow) -> BundleProblem:
+    """Connect all keyframes of a scene by the motions of the IMU."""
+    ends, n = np.r_[len(times) - 1, 0 : len(times) - 1], len(times)
+    links = InertialLinks(ends[:-1], ends[1:], motions_at(times, found), found.state.gravity)
+    down, sigma = np.tile([0.0, 1.0, 0.0], (n, 1)), np.full(n, 0.001)  # not used, and wrong
+    return replace(problem, links=links, gravity=down, gravity_sigma=sigma)
+
+
+@pytest.mark.parametrize("n_free", [5, 7])
+def test_global_and_local_bundle_adjustment_have_the_same_optimum(n_free):
+    problem, truth, times = scene(2)
+    T_cw = np.concatenate([problem.T_cw[:n_free], truth[n_free:]])
+    problem = replace(problem, n_free=n_free, T_cw=T_cw)
+    found = window(samples(ADIS16448))
+    together = linked(problem, times, found)
+    made = chain_of(found, motions_at(times, found), np.r_[7, 0:7], np.eye(3))
+    up = DOWN / np.linalg.norm(DOWN) / GRAVITY_SIGMA
+    prior = np.diag(np.repeat([0.0, GYRO_BIAS**-2, ACCEL_BIAS**-2], 3))
+    prior[:3, :3] = np.outer(up, up)
+    dense = adjust_with_imu(
+        problem, replace(made, information=prior), iterations=100, tolerance=1e-13
+    )
+    sparse = adjust_globally(together, iterations=100, tolerance=1e-13)
+    np.testing.assert_allclose(sparse.T_cw, dense.T_cw, atol=2e-5)
+    np.testing.assert_allclose(sparse.points, dense.points, atol=1e-3)
+    alone = adjust_globally(replace(problem, links=None), iterations=100, tolerance=1e-13)
+    assert np.abs(sparse.T_cw - alone.T_cw).max() > 1e-3
+
+
+def test_global_bundle_adjustment_does_not_use_samples_that_contradict_the_images():
+    problem, _, times = scene(0)
+    rows = samples(ADIS16448)
+    wrong = window(np.c_[rows[:, :1], np.degrees(rows[:, 1:4]), rows[:, 4:]])
+    together = linked(problem, times, wrong)
+    solution = adjust_globally(together, iterations=20)
+    level = adjust_globally(replace(together, links=None), iterations=20)
+    assert solution.T_cw.tobytes() == level.T_cw.tobytes()

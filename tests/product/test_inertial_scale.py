@@ -9,6 +9,7 @@ import pytest
 from conftest import corridor_mipmaps, render
 from inertial import ADIS16448, EUROC, Walk, seen_by
 
+from vslam.backend.metric_mapping import scale_of_map
 from vslam.datasets.euroc import open_euroc
 from vslam.datasets.imu import ImuFeed
 from vslam.method.inertia import SCALE_UNKNOWN
@@ -77,11 +78,23 @@ def test_the_map_becomes_metric_when_the_motion_tells_its_scale(drive):
     assert since - TIMES[first] < 3.0
     assert all((one.gravity is not None) == (one.timestamp > since) for one in results)
     n = len(drive.at_start)
-    assert scale_of(drive.at_start[first:], TRUTH[first:n]) == pytest.approx(1.0, abs=0.02)
+    assert scale_of(drive.at_start[first:], TRUTH[first:n]) == pytest.approx(1.0, abs=0.01)
     T_wc = drive.slam.trajectory().T_wc
     light = slice(first, DARK.start)
-    assert scale_of(T_wc[light], TRUTH[light]) == pytest.approx(1.0, abs=0.006)
+    assert scale_of(T_wc[light], TRUTH[light]) == pytest.approx(1.0, abs=0.003)
     assert SCALE_UNKNOWN not in drive.slam.problems
+
+
+def test_the_scale_does_not_depend_on_the_guess_and_its_error_is_known(drive):
+    session, map_ = drive.slam._session, drive.slam.map
+    inertial = session._motion.inertial_window()
+    R_wc = drive.results[-1].T_wc[:3, :3]
+    found = [
+        scale_of_map(map_, 0, drive.slam.context, inertial, R_wc, start) for start in (0.8, 1.2)
+    ]
+    assert all(one is not None and 5e-4 < one.sigma < 0.02 for one in found)
+    assert found[0].scale == pytest.approx(found[1].scale, rel=1e-3)
+    assert abs(np.log(found[0].scale)) < 3.0 * found[0].sigma
 
 
 def test_poses_at_the_time_of_tracking_and_odometry_are_metric_too(drive):

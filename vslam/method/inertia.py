@@ -52,12 +52,15 @@ CARRIED_S = 3.0  # s without images after which a pose counts as lost, not as ca
 START_S, RETRY_S, STRETCH_S, MOST_POSES = 0.5, 0.25, 1.0, 20
 FEWEST_POSES, LONGEST_S = 6, 4.0
 KEPT_S = 5.0  # s for which samples are kept
-# Stretches from which the scale of one camera is tried to be found, in seconds. The first poses of
-# a map are often so wrong that only a shorter stretch agrees with the samples. It is tried at most
-# every SCALE_RETRY_S seconds. A scale that is known is replaced by one whose standard deviation is
-# smaller by the factor MORE_CERTAIN, until it is as certain as SCALE_SIGMA.
-SCALE_STRETCHES, SCALE_RETRY_S = (8.0, 4.0, 2.0), 0.5
-SCALE_SIGMA, MORE_CERTAIN = 0.004, 0.7
+# Stretches that give the first guess of the scale of one camera, in seconds. The first poses of a
+# map are often so wrong that a shorter stretch agrees better with the samples. A guess whose
+# standard deviation is at most GUESS_SIGMA is the start of a bundle adjustment, which decides. It
+# is tried again when the map has grown by the share RETRY_SHARE of its time, at least after
+# SCALE_RETRY_S[0] seconds and at most after SCALE_RETRY_S[1] seconds. [own]
+SCALE_STRETCHES, GUESS_SIGMA = (8.0, 4.0, 2.0), 0.25
+RETRY_SHARE, SCALE_RETRY_S = 0.25, (0.5, 2.0)
+KEPT_WITHOUT_SCALE_S = 30.0  # s for which samples are kept while the scale is unknown
+METRIC_S = 2.0  # s of poses in metres that give the first state of one camera
 # Standard deviation of a feature in the image, as seen in the errors of the poses of one camera.
 SIGMA_PX = 0.15
 # Standard deviations of poses by images at the start, along each axis: metres and radians. Errors
@@ -228,54 +231,70 @@ def _rests(before: InertialState, after: InertialState) -> bool:
     return bool(gained < REST_ACCEL * seconds and np.linalg.norm(turn) < REST_RATE * seconds)
 
 
-def seeks_scale(inertia: Inertia) -> bool:
-    """Return whether the scale of the map of one camera is not certain enough yet."""
-    return not 0.0 <= inertia.scale_sigma <= SCALE_SIGMA
-
-
-def found_scale(
+def guessed_scale(
     inertia: Inertia, run: PoseRun, sigma: float, calibration: ImuCalibration
 ) -> tuple[Inertia, GravityState | None]:
-    """Try to find the scale of the map of one camera from the frames that were tracked last.
+    """Guess the scale of the map of one camera from the frames that were tracked last.
 
     Args:
         run: poses of the camera as it is mounted, in the map.
         sigma: standard deviation of these poses along each axis, in units of the map.
 
     Returns:
-        What is known, and the scale with the state of the IMU at the last pose, in metres. None if
-        the scale is not certain, or not much more certain than it was.
+        What is known, and the most certain guess, with the state of the IMU at the last pose. None
+        if no guess is useful, or if it is too early to try again.
     """
-    times, found = run.times, None
-    now = float(times[-1]) if len(times) else inertia.tried
-    if now - inertia.tried < SCALE_RETRY_S:
+    times, best = run.times, None
+    if not len(times):
         return inertia, None
-    limit = MORE_CERTAIN * inertia.scale_sigma if inertia.scale_sigma >= 0.0 else np.inf
+    now, since = float(times[-1]), float(times[0])
+    if now - inertia.tried < np.clip(RETRY_SHARE * (now - since), *SCALE_RETRY_S):
+        return inertia, None
     for seconds in SCALE_STRETCHES:
-        chosen = times >= now - seconds
-        if now - times[0] < 0.5 * seconds or found is not None:
+        if now - since < 0.5 * seconds:
             continue
+        chosen = times >= now - seconds
         stretch = PoseStretch(times[chosen], run.T_wc[chosen], sigma, SIGMA_RAD)
         found = find_gravity(stretch, inertia.samples, calibration, known_scale=False)
-        if found is not None and (found.doubt or found.scale_sigma > limit):
-            found = None
-    return replace(inertia, tried=now), found
+        if found is None or not found.scale_sigma <= GUESS_SIGMA:
+            continue
+        if best is None or found.scale_sigma < best.scale_sigma:
+            best = found
+    return replace(inertia, tried=now), best
 
 
-def in_metres(inertia: Inertia, found: GravityState, T_odom_map: Matrix) -> Inertia:
+def in_metres(
+    inertia: Inertia,
+    run: PoseRun,
+    scale_sigma: float,
+    sigma: float,
+    T_odom_map: Matrix,
+    calibration: ImuCalibration,
+) -> Inertia:
     """Return what is known when the map of one camera has become metric.
 
     Args:
-        T_odom_map: ``(4, 4)``, maps points of the map, in metres, to the frame of the odometry.
+        run: poses of the frames that were tracked last, as the camera is mounted, in metres.
+        scale_sigma: standard deviation of the logarithm of the scale.
+        sigma: standard deviation of the poses along each axis, in metres.
+        T_odom_map: ``(4, 4)``, maps points of the map to the frame of the odometry.
     """
-    now = found.state.timestamp
-    return replace(
+    now = float(run.times[-1])
+    chosen = run.times >= now - METRIC_S
+    stretch = PoseStretch(run.times[chosen], run.T_wc[chosen], sigma, SIGMA_RAD)
+    found = find_gravity(stretch, inertia.samples, calibration, known_scale=True)
+    metric = replace(
         _forgotten(inertia),
+        scale_sigma=scale_sigma,
+        metric_since=now if inertia.metric_since < 0.0 else inertia.metric_since,
+    )
+    if found is None or found.doubt:  # it is found from the next frames
+        return metric
+    return replace(
+        metric,
         state=in_another_world(found.state, T_odom_map),
         refused=0,
         known_since=now if inertia.known_since < 0.0 else inertia.known_since,
-        scale_sigma=found.scale_sigma,
-        metric_since=now if inertia.metric_since < 0.0 else inertia.metric_since,
     )
 
 

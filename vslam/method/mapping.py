@@ -8,8 +8,12 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from vslam.backend.disparity_offset import map_and_calibrate
+from vslam.backend.keyframe_motions import record_motion
 from vslam.backend.local_mapping import MIN_SHARED, refresh_keyframe
+from vslam.backend.metric_mapping import WIDE_EVERY, MapScale, adjust_widely, scale_of_map
 from vslam.backend.triangulation import map_stereo_points
 from vslam.frontend.patches import certainty_of
 from vslam.method.closing import LoopClosing
@@ -143,17 +147,35 @@ class Mapper:
             replace(second, T_cw=frames.pose(second.index), twist=twist),
         )
 
-    def rescale(self, scale: float, *tracks: Track) -> tuple[Track, ...]:
+    def find_scale(self, start: float, inertial: InertialWindow) -> MapScale | None:
+        """Find the scale of the map, or of its newest sub-map if the map is metric, from the
+        samples of an IMU (``scale_of_map``).
+
+        Args:
+            inertial: what is known from the IMU at the last frame, and all samples since the map
+                began.
+        """
+        R_wc = self.published.frames.pose(-1)[:3, :3].T
+        with self.published.change() as map_:
+            first = newest_unit(map_)
+            missing = np.flatnonzero(map_.keyframes.motion_seconds[: map_.n_keyframes] == 0.0)
+            for keyframe in missing[missing > first].tolist():
+                record_motion(map_, keyframe, inertial)
+            return scale_of_map(map_, first, self._context, inertial, R_wc, start)
+
+    def rescale(self, scale: float, inertial: InertialWindow, *tracks: Track) -> tuple[Track, ...]:
         """Make the metre the unit of the map, or of its newest sub-map if the map is metric. Return
         the moved tracks.
 
         Args:
             scale: metres per unit.
+            inertial: what is known from the IMU at the last frame.
             tracks: as they are when everything is complete.
         """
         with self.published.change() as map_:
             self._closing.rescale(map_, newest_unit(map_), scale)
             map_.scalars = replace(map_.scalars, metric=True)
+            self._adjust_widely(map_, inertial)
         return self.published.renew_view(*tracks)
 
     def find_old_place(self, track: Track) -> OldPlace | None:
@@ -171,13 +193,20 @@ class Mapper:
         if self._closing.count_reused_keyframe(map_, new=new):
             published.start(self._closing.finish)
 
-    def finish(self, *tracks: Track) -> tuple[Track, ...]:
+    def finish(self, *tracks: Track, inertial: InertialWindow | None = None) -> tuple[Track, ...]:
         """Complete all running work at the end of a drive, including a global bundle adjustment.
-        Return the moved tracks."""
+        Return the moved tracks.
+
+        Args:
+            inertial: what is known from the IMU at the last frame, for a monocular map. None
+                without an IMU.
+        """
         tracks = self.published.complete(*tracks)
         with self.published.change() as map_:
             self._closing.conclude(map_)
             self._closing.finish(map_)
+            if inertial is not None:
+                self._adjust_widely(map_, inertial)
         return self.published.renew_view(*tracks) if map_.n_keyframes else tracks
 
     def _make_room(self, map_: Map, track: Track) -> Track:
@@ -191,6 +220,15 @@ class Mapper:
         landmark[track.landmark >= 0] = new_id[track.tracked]
         return replace(track, landmark=landmark)
 
+    def _adjust_widely(self, map_: Map, inertial: InertialWindow) -> None:
+        """Adjust the newest keyframes with what is known from the IMU at the last frame."""
+        keyframe, R_wc = int(map_.living_keyframes()[-1]), self.published.frames.pose(-1)[:3, :3].T
+        adjust_widely(map_, keyframe, self._context, inertial, R_wc)
+
     def _map_keyframe(self, keyframe: int, inertial: InertialWindow | None, map_: Map) -> None:
         map_and_calibrate(map_, keyframe, self._context, inertial)
+        wide = self._context.camera.monocular and keyframe % WIDE_EVERY == 0
+        if wide and inertial is not None:
+            R_wc = map_.keyframe_pose(keyframe)[:3, :3].T
+            adjust_widely(map_, keyframe, self._context, inertial, R_wc)
         self._closing.apply_adjustment_if_due(map_, keyframe)

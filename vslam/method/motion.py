@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vslam.backend.inertial_filter import camera_pose
-from vslam.backend.inertial_start import GravityState
+from vslam.backend.metric_mapping import MapScale
 from vslam.frontend.initialization import KnownTurn
 from vslam.frontend.motion_time import RECENT, motion_seconds
 from vslam.frontend.prediction import Prediction
@@ -18,18 +18,18 @@ from vslam.method.gyro import turn_by_gyro, turn_of_start, with_turn
 from vslam.method.inertia import (
     CARRIED_S,
     KEPT_S,
+    KEPT_WITHOUT_SCALE_S,
     LONGEST_GAP,
     SCALE_STRETCHES,
     SIGMA_PX,
-    found_scale,
     gravity_direction,
+    guessed_scale,
     in_metres,
     is_refused,
     lost,
     predicted_covariance,
     predicted_motion,
     predicted_state,
-    seeks_scale,
     tracked,
     with_samples,
     without_scale,
@@ -155,7 +155,7 @@ class Motion:
 
     def add_samples(self, samples: ArrayLike) -> None:
         """Add samples of the IMU, see ``Slam.add_imu``."""
-        kept_s = SCALE_STRETCHES[0] + 1.0 if self.seeks_scale else KEPT_S
+        kept_s = KEPT_WITHOUT_SCALE_S if self.seeks_scale else KEPT_S
         inertia = with_samples(self.state.inertia, samples, kept_s)
         self.state = replace(self.state, inertia=inertia)
 
@@ -172,40 +172,67 @@ class Motion:
     @property
     def seeks_scale(self) -> bool:
         """Whether the IMU is to tell the scale of a monocular map."""
-        usable = self._imu is not None and self._context.camera.monocular
-        return usable and seeks_scale(self.state.inertia)
+        return self._imu is not None and not self.is_metric
 
-    def find_scale(self, view: MapView, keyframe: int) -> GravityState | None:
-        """Try to find the scale of a monocular map from the last frames and the samples. Return it
-        if it is certain, or much more certain than it was.
+    def guess_scale(self, view: MapView, keyframe: int) -> tuple[float, InertialWindow] | None:
+        """Guess the scale of a monocular map from the last frames and the samples.
 
         Args:
             keyframe: the first keyframe whose unit of length is that of the newest keyframe.
-        """
-        local, camera = view.local_landmarks, self._context.camera
-        run = self._frames.last_run(SCALE_STRETCHES[0], keyframe)
-        if self._imu is None or not len(local.ids) or not len(run.times):
-            return None
-        depth = float(np.median(transform(view.T_reference, local.xyz)[:, 2]))
-        mounted = PoseRun(run.times, camera.as_mounted(run.T_wc))
-        sigma = SIGMA_PX / camera.fx * depth
-        inertia, found = found_scale(self.state.inertia, mounted, sigma, self._imu)
-        self.state = replace(self.state, inertia=inertia)
-        return found
 
-    def use_metres(self, found: GravityState, *, whole: bool) -> None:
+        Returns:
+            Metres per unit of the map, and the samples with the state of the IMU in the frame of
+            the map. None if no guess is useful, or if it is too early to try again.
+        """
+        run, sigma = self._last_run(view, keyframe)
+        if self._imu is None or not sigma > 0.0:
+            return None
+        inertia, found = guessed_scale(self.state.inertia, run, sigma, self._imu)
+        self.state = replace(self.state, inertia=inertia)
+        if found is None:
+            return None
+        window = self._window(found.state, self._imu)
+        return found.scale, replace(window, R_odom_camera=self._frames.pose(-1)[:3, :3].T)
+
+    def use_metres(self, view: MapView, keyframe: int, found: MapScale, *, whole: bool) -> None:
         """Follow the camera in metres, after the map was scaled.
 
         Args:
+            view: of the scaled map.
+            keyframe: the first one that was scaled.
             whole: whether the whole map was scaled, not only its newest sub-map.
         """
         assert self._imu is not None
         odometry = self.state.odometry
         if whole:
             odometry = odometry.scaled(found.scale)
-        T_wc = camera_pose(found.state, self._imu.T_imu_camera)
-        inertia = in_metres(self.state.inertia, found, odometry.T_odom_camera @ inverse(T_wc))
+        run, sigma = self._last_run(view, keyframe)
+        T_odom_map = odometry.T_odom_camera @ inverse(run.T_wc[-1])
+        inertia = in_metres(self.state.inertia, run, found.sigma, sigma, T_odom_map, self._imu)
         self.state = replace(self.state, odometry=odometry, inertia=inertia)
+
+    def _last_run(self, view: MapView, keyframe: int) -> tuple[PoseRun, float]:
+        """Return the poses of the frames that were tracked last, as the camera is mounted, and
+        their standard deviation along each axis, in units of the map; 0 if it is unknown.
+
+        Args:
+            keyframe: the first keyframe whose unit of length is that of the newest keyframe.
+        """
+        local, camera = view.local_landmarks, self._context.camera
+        run = self._frames.last_run(SCALE_STRETCHES[0], keyframe)
+        mounted, sigma = PoseRun(run.times, camera.as_mounted(run.T_wc)), 0.0
+        if len(local.ids):
+            depth = float(np.median(transform(view.T_reference, local.xyz)[:, 2]))
+            sigma = SIGMA_PX / camera.fx * depth
+        return mounted, sigma
+
+    def inertial_window(self) -> InertialWindow | None:
+        """Return what bundle adjustment of a monocular map needs to know from the IMU at the last
+        frame; None if it is unknown."""
+        state = self.state.inertia.state
+        if self._imu is None or state is None or not self._context.camera.monocular:
+            return None
+        return self._window(state, self._imu)
 
     def _carried(self, track: Track, predicted: Prediction) -> Inertia:
         """Return what is known from the IMU after a frame that was not tracked."""

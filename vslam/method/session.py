@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vslam.backend.inertial_filter import BIAS
+from vslam.backend.inertial_start import MAX_SCALE_SIGMA
 from vslam.config import changed_thresholds
 from vslam.frontend.images import Images
 from vslam.frontend.orb import level_shapes
@@ -228,7 +229,8 @@ class Session:
 
     def finish(self) -> None:
         """Complete all mapping."""
-        moved = self._mapper.finish(*self._held)
+        inertial = self._motion.inertial_window() if self._mode.changes_map else None
+        moved = self._mapper.finish(*self._held, inertial=inertial)
         self.last = moved[0] if moved else None
 
     def _check(self, timestamp: float) -> None:
@@ -257,18 +259,23 @@ class Session:
         if self.last is None or not motion.seeks_scale:
             return
         moved = published.complete(self.last)
-        first = newest_unit(published.map)
-        found = motion.find_scale(published.view, first)
-        if found is not None:
-            moved = self._mapper.rescale(found.scale, *moved)
-            motion.use_metres(found, whole=first == 0)
-            if first == 0:
-                self.opened = replace(self.opened, truth_alignment=None)
-            _log.info(
-                "the scale is known from the IMU at %.3f s, with a standard deviation of %.1f %%",
-                found.state.timestamp, 100.0 * found.scale_sigma,
-            )  # fmt: skip
-        self.last = replace(moved[0], still=None) if found else moved[0]
+        self.last, first = moved[0], newest_unit(published.map)
+        guess = motion.guess_scale(published.view, first)
+        if guess is None:
+            return
+        start, inertial = guess
+        found = self._mapper.find_scale(start, inertial)
+        if found is None or not found.sigma <= MAX_SCALE_SIGMA:
+            return
+        moved = self._mapper.rescale(found.scale, inertial, *moved)
+        self.last = replace(moved[0], still=None)
+        motion.use_metres(published.view, first, found, whole=first == 0)
+        if first == 0:
+            self.opened = replace(self.opened, truth_alignment=None)
+        _log.info(
+            "the scale is known from the IMU at %.3f s, with a standard deviation of %.1f %%",
+            published.frames.timestamp(-1), 100.0 * found.sigma,
+        )  # fmt: skip
 
     def _begin(
         self,

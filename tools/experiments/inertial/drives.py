@@ -12,20 +12,23 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from vslam.datasets.frames import Source
+from vslam.datasets.frames import Source, TimedFrame
 from vslam.datasets.kitti import open_kitti
 from vslam.slam import Slam
-from vslam.types.camera import Camera
+from vslam.types.camera import Camera, Sensor
 from vslam.types.features import TrackingState
 from vslam.types.geometry import inverse
 from vslam.types.imu import ImuCalibration
 from vslam_lab.towns import Route, Variation, render_sequence, route_named
 from vslam_lab.towns.inertial import imu_on_camera, simulated_imu
+from vslam_lab.towns.store import DEPTH_SCALE
 
 Float = NDArray[np.float64]
 _CHILD = Path(__file__).with_name("orbslam3.py")
@@ -42,6 +45,7 @@ class Drive:
         samples: ``(M, 7)`` samples of the IMU.
         imu: where the IMU is.
         dark: ``(N,)`` bool, whether the images of a frame are black.
+        sensor: which images of the rendered frames are used.
     """
 
     name: str
@@ -50,10 +54,30 @@ class Drive:
     samples: Float
     imu: ImuCalibration
     dark: NDArray[np.bool_]
+    sensor: Sensor = "stereo"
 
     @property
     def times(self) -> Float:
         return self.source.timestamps
+
+    @property
+    def camera(self) -> Camera:
+        camera = self.source.camera
+        if self.sensor == "mono":
+            return camera.left_camera()
+        return replace(camera, depth=self.sensor == "rgbd")
+
+    def images(self, k: int, frame: TimedFrame) -> tuple[Any, Any]:
+        """Return the images of the k-th frame as ``Slam.step`` takes them."""
+        left, second = frame.read(map)
+        if self.sensor == "mono":
+            second = None
+        elif self.sensor == "rgbd":
+            file = str(frame.file).replace("image_0", "depth_0")
+            second = (cv2.imread(file, cv2.IMREAD_UNCHANGED) / DEPTH_SCALE).astype(np.float32)
+        if self.dark[k]:
+            return np.zeros_like(left), None if second is None else np.zeros_like(second)
+        return left, second
 
     def with_dark(self, frames: NDArray[np.bool_]) -> Drive:
         return replace(self, dark=frames)
@@ -105,7 +129,13 @@ def spinning(route: Route, degrees_per_s: float, swing: float) -> Route:
 
 
 def drive_of(
-    route: Route, seed: int, cache: Path, *, frames: slice = slice(None), every: int = 1
+    route: Route,
+    seed: int,
+    cache: Path,
+    *,
+    frames: slice = slice(None),
+    every: int = 1,
+    sensor: Sensor = "stereo",
 ) -> Drive:
     """Render what is missing of a route, and open some of its frames.
 
@@ -123,11 +153,13 @@ def drive_of(
     kept = (samples[:, 0] >= shift - 1e-9) & (samples[:, 0] <= shift + part.timestamps[-1] + 1e-9)
     samples = samples[kept]
     samples[:, 0] -= shift
-    root = render_sequence(part, Variation(seed=seed), cache)
+    depth = sensor == "rgbd"
+    cache = cache / "depth" if depth else cache
+    root = render_sequence(part, Variation(seed=seed), cache, depth=depth)
     source = open_kitti(root, part.name, every=every)
     name = f"{route.name}+seed:{seed}"
     dark = np.zeros(len(source), np.bool_)
-    return Drive(name, source, part.ground_truth[::every], samples, imu_on_camera(), dark)
+    return Drive(name, source, part.ground_truth[::every], samples, imu_on_camera(), dark, sensor)
 
 
 def built_in(name: str, seed: int) -> Route:
@@ -138,17 +170,16 @@ def built_in(name: str, seed: int) -> Route:
 
 def run_vslam(drive: Drive, *, imu: bool) -> Run:
     """Run vslam without loop detection, one frame after the other."""
-    slam = Slam(drive.source.camera, imu=drive.imu if imu else None, detector="none", threads=1)
+    slam = Slam(drive.camera, imu=drive.imu if imu else None, detector="none", threads=1)
     results, before = [], -np.inf
     for k, frame in enumerate(drive.source.frames()):
-        images = frame.read(map)
-        if drive.dark[k]:
-            images = tuple(np.zeros_like(image) for image in images)
         times = drive.samples[:, 0]
         # The first sample at or after the frame is passed, too, as by a run.
         new = drive.samples[(times > before) & (times <= frame.timestamp + 1e-6)]
         before = frame.timestamp + 1e-6
-        results.append(slam.step(*images, frame.timestamp, imu=new if imu else None))
+        results.append(
+            slam.step(*drive.images(k, frame), frame.timestamp, imu=new if imu else None)
+        )
     slam.finish()
     unknown = np.full(3, np.nan)
     gravity = [unknown if one.gravity is None else one.gravity for one in results]

@@ -1,0 +1,182 @@
+"""Bundle adjustment that gives the map of one camera its scale, from the samples of an IMU.
+
+Images do not tell the scale of a map, which drifts from keyframe to keyframe. Local bundle
+adjustment with an IMU (``backend/inertial_adjustment.py``) cannot mend it, because older keyframes
+hold its window. Here, the newest keyframes are adjusted all together, at certain keyframes and at
+the end of a drive (Campos et al., ORB-SLAM3, T-RO 2021, section V-B; there, it is done twice after
+the start).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vslam.backend.bundle_adjustment import (
+    BundleProblem,
+    cholesky_solve,
+    empty_equations,
+    linearise,
+    observations_of,
+    reduced_system,
+)
+from vslam.backend.inertial_adjustment import (
+    InertialChain,
+    adjust_with_imu,
+    chain_of,
+    linear_factors,
+    start_values,
+)
+from vslam.backend.inertial_filter import BIAS, FALL, N
+from vslam.backend.inertial_start import ACCEL_BIAS, GYRO_BIAS
+from vslam.backend.keyframe_motions import motions_between
+from vslam.backend.local_mapping import assemble, remove_observations, window_landmarks
+from vslam.types.context import Context
+from vslam.types.geometry import Matrix, inverses
+from vslam.types.imu import GRAVITY, InertialWindow
+from vslam.types.map import Map
+from vslam.types.map_kernels import refresh_landmarks
+
+# The number of newest keyframes that are adjusted together, and after how many new keyframes. They
+# are 10 to 40 s of a drive. [own]
+WIDE_KEYFRAMES, WIDE_EVERY = 100, 20
+_ITERATIONS, _TOLERANCE = 15, 1e-6
+# What is known of gravity before the adjustment: its length, and hardly its direction (m/s^2, rad).
+_LENGTH, _TILT = 1e-3, 0.1
+
+
+@dataclass(frozen=True)
+class MapScale:
+    """The scale of a map of one camera.
+
+    Attributes:
+        scale: metres per unit of the map.
+        sigma: standard deviation of its logarithm.
+    """
+
+    scale: float
+    sigma: float
+
+
+def scale_of_map(
+    map_: Map,
+    first: int,
+    context: Context,
+    inertial: InertialWindow,
+    R_world_camera: Matrix,
+    start: float,
+) -> MapScale | None:
+    """Find the scale of the newest keyframes by a bundle adjustment with an IMU. The map is only
+    read.
+
+    Args:
+        first: the first keyframe whose unit of length is that of the newest keyframe.
+        inertial, R_world_camera: see ``adjust_widely``.
+        start: about how many metres a unit of the map has.
+
+    Returns:
+        None if samples are missing, or do not agree with the images.
+    """
+    chain = _newest_chain(map_, first, int(map_.living_keyframes()[-1]), inertial, R_world_camera)
+    if chain is None:
+        return None
+    ids = chain.camera
+    cameras = np.concatenate([ids[1:], ids[:1]])  # the oldest one is held fixed
+    landmarks, _ = window_landmarks(map_.arrays, ids, map_.n_landmarks, map_.n_keyframes)
+    landmarks = landmarks[map_.arrays.n_observations[landmarks] > 1]
+    problem, _ = assemble(map_, ids[1:], ids[:1], landmarks, context.camera)
+    T_cw = problem.T_cw.copy()
+    T_cw[:, :3, 3] *= start
+    problem = replace(problem, T_cw=T_cw, points=start * problem.points)
+    chain = replace(chain, camera=_indices(map_, cameras)[ids])
+    found = adjust_with_imu(problem, chain, iterations=_ITERATIONS, tolerance=_TOLERANCE)
+    if found is None:
+        return None
+    used = found.inlier
+    problem = replace(problem, T_cw=found.T_cw, points=found.points)
+    before, after = (inverses(T)[:, :3, 3] for T in (T_cw, found.T_cw))
+    before, after = before - before.mean(axis=0), after - after.mean(axis=0)
+    growth = float(np.sqrt(np.sum(after**2) / np.sum(before**2)))
+    return MapScale(start * growth, _scale_sigma(problem, chain, used))
+
+
+def adjust_widely(
+    map_: Map, keyframe: int, context: Context, inertial: InertialWindow, R_world_camera: Matrix
+) -> None:
+    """Run bundle adjustment with an IMU over the newest keyframes up to one of them.
+
+    Older keyframes that observe the same landmarks are held fixed.
+
+    Args:
+        inertial: what is known from the IMU at a frame.
+        R_world_camera: ``(3, 3)`` rotation of the camera at this frame, in the world frame.
+    """
+    restarts = map_.restarts
+    first = restarts[-1] if restarts else 0
+    chain = _newest_chain(map_, first, keyframe, inertial, R_world_camera)
+    if chain is None:
+        return
+    ids, a = chain.camera, map_.arrays
+    landmarks, others = window_landmarks(a, ids, map_.n_landmarks, map_.n_keyframes)
+    free, fixed = ids, np.flatnonzero(others)
+    if ids[0] == 0 or not len(fixed):
+        free, fixed = ids[1:], np.concatenate([ids[:1], fixed])
+    problem, rows = assemble(map_, free, fixed, landmarks, context.camera)
+    chain = replace(chain, camera=_indices(map_, np.concatenate([free, fixed]))[ids])
+    found = adjust_with_imu(problem, chain, iterations=_ITERATIONS, tolerance=_TOLERANCE)
+    if found is None:
+        return
+    a.T_cw[free] = found.T_cw[: len(free)]
+    a.xyz[landmarks] = found.points
+    remove_observations(a, rows[~found.inlier])
+    refresh_landmarks(a, landmarks, map_.scales)
+
+
+def _newest_chain(
+    map_: Map, first: int, keyframe: int, inertial: InertialWindow, R_world_camera: Matrix
+) -> InertialChain | None:
+    """Connect the newest keyframes from ``first`` to ``keyframe``, by their ids."""
+    ids = map_.living_keyframes().astype(np.int64)
+    ids = ids[(ids >= first) & (ids <= keyframe)]
+    ids = ids[map_.sessions[ids] == map_.sessions[keyframe]][-WIDE_KEYFRAMES:]
+    if len(ids) < 2:
+        return None
+    down = inertial.state.gravity / np.linalg.norm(inertial.state.gravity)
+    along, unknown = np.outer(down, down), np.zeros((N, N))
+    unknown[FALL, FALL] = _LENGTH**2 * along + (_TILT * GRAVITY) ** 2 * (np.eye(3) - along)
+    unknown[BIAS, BIAS] = np.diag(np.repeat([GYRO_BIAS**2, ACCEL_BIAS**2], 3))
+    found = replace(inertial, state=replace(inertial.state, covariance=unknown))
+    return chain_of(found, motions_between(map_, ids), ids, R_world_camera)
+
+
+def _indices(map_: Map, cameras: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the index of each keyframe of the map among the cameras of a problem, or -1."""
+    index = np.full(map_.n_keyframes, -1, np.int64)
+    index[cameras] = np.arange(len(cameras))
+    return index
+
+
+def _scale_sigma(problem: BundleProblem, chain: InertialChain, use: NDArray[np.bool_]) -> float:
+    """Return the standard deviation of the logarithm of the scale of the positions of all cameras
+    (Umeyama, 1991), at the solution of a problem."""
+    n_free, n_points = problem.n_free, len(problem.points)
+    observations = observations_of(problem, use)
+    equations = empty_equations(n_free, n_points, len(problem.camera))
+    size = 6 * n_free + chain.n_unknowns
+    S, rhs, V_inverse = np.empty((size, size)), np.empty(size), np.empty((n_points, 3, 3))
+    linearise(problem.T_cw, n_free, problem.points, observations, equations)
+    reduced_system(n_free, observations, equations, 1e-9, S, rhs, V_inverse)
+    states = start_values(problem.T_cw, chain)
+    S += linear_factors(problem.T_cw, states, chain, n_free).hessian
+    centre = inverses(problem.T_cw)[:, :3, 3]
+    apart = centre - centre.mean(axis=0)
+    by_centre = apart / np.sum(apart**2)
+    rhs[:] = 0.0  # an increment moves the camera by -R_wc rho
+    along = rhs[: 6 * n_free].reshape(-1, 6)
+    along[:, :3] = -np.einsum("nij,nj->ni", problem.T_cw[:n_free, :3, :3], by_centre[:n_free])
+    derivative = rhs.copy()
+    if not cholesky_solve(S, rhs):
+        return float("inf")
+    return float(np.sqrt(derivative @ rhs))

@@ -188,24 +188,21 @@ def matched(corners: Corners, context: Context, keypoints: Keypoints | None = No
     found, matches, depth, sides, problem = corners
     if sides is not None and sides.black == "left":
         return Extracted(Features.none(), sides=sides)
-    # Without a pyramid, matches are not aligned. Depth cameras have a rolling shutter, which moves
-    # points by more than alignment corrects.
-    pyramid = None if camera.depth else found.pyramid
-    if depth is not None:
-        scale = context.scales[found.octave]
-        u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
-        return Extracted(_features(found, u_right), pyramid, problem=problem)
     if keypoints is not None:
         more = extract_at(found, *keypoints)
         found, order = found.joined(more)
         if matches is not None:
             added = match_stereo(more, matches.right, camera)
             matches = matches.joined(added, order)
+    if depth is not None:
+        scale = context.scales[found.octave]
+        u_right = columns_of_depth(found.xy, scale, depth, camera, config.depth)
+        return Extracted(_features(found, u_right), found.pyramid, problem=problem)
     if matches is None:
         u_right = np.full(len(found.xy), np.nan, np.float32)
-        return Extracted(_features(found, u_right), pyramid, problem=problem)
+        return Extracted(_features(found, u_right), found.pyramid, problem=problem)
     u_right = inliers_only(matches, found.octave)
-    return Extracted(_features(found, u_right), pyramid, sides=sides, problem=problem)
+    return Extracted(_features(found, u_right), found.pyramid, sides=sides, problem=problem)
 
 
 def _features(found: Extraction, u_right: NDArray[np.float32]) -> Features:

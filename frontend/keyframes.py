@@ -44,7 +44,8 @@ class KeyframeEvidence:
 
     Attributes:
         seconds_since_keyframe: time since the last keyframe, seconds.
-        n_inliers: number of landmarks that this frame tracks.
+        n_inliers: number of landmarks that this frame tracks. If not all patches were searched
+            for (``MapView.patch_stride``), this and the numbers of close points are estimates.
         n_reference: number of landmarks of the reference keyframe that enough keyframes observe
             (``MapView.n_reference``).
         tracked_close: number of close stereo features of this frame that track a landmark.
@@ -198,12 +199,13 @@ class KeyframePolicy:
             depth = feature_depth(track.features, self._context.camera)
             close = depth < self._context.close_depth
             untracked_close = int(np.count_nonzero(close & ~tracked))
-        tracked_close = int(np.count_nonzero(close & tracked))
+        stride = view.patch_stride if track.by_patches else 1
+        tracked_close = stride * int(np.count_nonzero(close & tracked))
         state = count_close(self.state, tracked_close, track.index)
         self.state = state
         return KeyframeEvidence(
             seconds_since_keyframe=seconds_since_keyframe,
-            n_inliers=int(np.count_nonzero(tracked)),
+            n_inliers=stride * int(np.count_nonzero(tracked)),
             n_reference=view.n_reference,
             tracked_close=tracked_close,
             untracked_close=untracked_close,

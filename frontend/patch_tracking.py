@@ -20,15 +20,20 @@ from vslam.frontend.pose import MIN_TRUSTED, optimise_pose
 from vslam.frontend.standstill import MEASURE_SHARE, is_small, still_stands
 from vslam.frontend.tracking import predict_landmarks, trusted_landmarks
 from vslam.types.context import Context
-from vslam.types.features import PATCH_RADIUS, Features, Pyramid
+from vslam.types.features import PATCH_RADIUS, Features, LandmarkPatches, Pyramid
 from vslam.types.geometry import Matrix, orthonormalised, transform
-from vslam.types.map_view import MapView
+from vslam.types.map_view import LocalMap, MapView
 from vslam.types.track import Standstill
 
 _MARGIN = PATCH_RADIUS + 2  # least distance of a patch centre from the border of its level, pixels
 
 # In ordinary drives, at least this share of the expected trusted landmarks agrees with the pose.
 SUPPORT_SHARE = 0.4
+
+
+# About this many patches are searched for in a frame of an RGB-D camera. SVO tracks 120 to 180.
+# [own]
+_ENOUGH = 500
 
 
 class PatchTrack(NamedTuple):
@@ -114,6 +119,26 @@ class _Found(NamedTuple):
         return self._replace(seen=self.seen[chosen], xy=self.xy[chosen], level=self.level[chosen])
 
 
+def stride_of(patches: LandmarkPatches, local: LocalMap, T_cw: Matrix, context: Context) -> int:
+    """Return the ``MapView.patch_stride``. It is 1 for a stereo or monocular camera.
+
+    An RGB-D camera maps nearly all features of a keyframe at once, so that thousands of landmarks
+    are visible in a room. With 500 of them, poses are already more accurate than by features. The
+    others are left out evenly, so that the shares of patches that are found, that agree with the
+    pose and that are trusted stay the same.
+
+    Args:
+        patches: patches of landmarks of ``local``.
+        T_cw: ``(4, 4)`` pose of the reference keyframe (world to camera).
+    """
+    if not context.camera.depth:
+        return 1
+    at = np.searchsorted(local.ids, patches.ids)
+    known = LocalMap._make(values[at] for values in local)
+    _, radius, _ = predict_landmarks(T_cw, known, 1.0, None, context)
+    return max(1, round(np.count_nonzero(radius) / _ENOUGH))
+
+
 def track_patches(
     pyramid: Pyramid,
     T_cw: Matrix,
@@ -170,7 +195,7 @@ def track_standing(
 def _search(
     pyramid: Pyramid, T_cw: Matrix, view: MapView, context: Context, mask: Mask | None
 ) -> _Found:
-    known, local = view.patches, view.with_patches
+    known, local = view.searched, view.with_patches
     camera, scales, config = context.camera, context.scales, context.config.alignment
     uvr, radius, octave = predict_landmarks(T_cw, local, 1.0, mask, context)
     margin = _MARGIN * scales[octave]
@@ -203,14 +228,14 @@ def _optimised(
     trusted[expected] = trusted_landmarks(
         view.with_patches.confirmed[expected], view.with_patches.xyz[expected], T_cw, context
     )
-    known, local, scale = view.patches, view.with_patches, context.scales[found.level]
+    known, local, scale = view.searched, view.with_patches, context.scales[found.level]
     uvr = np.full((len(found.seen), 3), np.nan)
     uvr[:, :2] = found.xy
     T_found, inlier = optimise_pose(
         T_cw,
         local.xyz[found.seen],
         uvr,
-        context.config.alignment.certainty * scale**-2.0,
+        context.aligned_certainty * scale**-2.0,
         context.camera.intrinsics,
         trusted=trusted[found.seen] if ask_trusted else None,
         confirmed=local.confirmed[found.seen],

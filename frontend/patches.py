@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.config import AlignmentConfig
 from vslam.support.kernels import kernel
+from vslam.types.context import Context
 from vslam.types.features import (
     PATCH_PIXELS,
     PATCH_RADIUS,
@@ -120,7 +120,7 @@ def patches_of_landmarks(
 class RecentPatches:
     """Stores the image patches around the features of the newest ``capacity`` keyframes.
 
-    Frames without an image pyramid, such as RGB-D frames, have no patches.
+    Frames without an image pyramid have no patches.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -198,7 +198,7 @@ def _widened(array: NDArray, n: int) -> NDArray:
     return wide
 
 
-def certainty_of(track: Track, config: AlignmentConfig) -> NDArray[np.uint8] | int:
+def certainty_of(track: Track, context: Context) -> NDArray[np.uint8] | int:
     """Compute the ``(N,)`` uint8 certainty of the position of each feature (``Arrays.certainty``):
     the usual variance of a keypoint's position, divided by the variance of this position. It is 1
     for all features of a frame without a pyramid.
@@ -210,7 +210,7 @@ def certainty_of(track: Track, config: AlignmentConfig) -> NDArray[np.uint8] | i
     if track.extracted.pyramid is None:
         return 1
     unaligned = (track.landmark >= 0) & ~track.aligned
-    return np.where(unaligned, 1, config.certainty).astype(np.uint8)
+    return np.where(unaligned, 1, context.aligned_certainty).astype(np.uint8)
 
 
 @kernel

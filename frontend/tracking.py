@@ -468,7 +468,7 @@ def _observed_points(
         shift = track.shift[matched]
         aligned = np.isfinite(shift[:, 0])
         uvr[aligned] += shift[aligned][:, [0, 1, 0]]
-        certainty[aligned] = context.config.alignment.certainty
+        certainty[aligned] = context.aligned_certainty
     disparity_weight = DISPARITY_WEIGHT / np.sqrt(certainty)
     intrinsics = context.camera.intrinsics
     return track.xyz[matched], uvr, weight * certainty, intrinsics, disparity_weight

@@ -284,10 +284,9 @@ def test_the_same_bytes_with_two_threads_and_after_a_resume(corridor, tmp_path):
     assert resumed >= 3
 
 
-def test_depth_cameras_are_tracked_by_features(corridor):
-    camera = replace(corridor.camera, depth=True)
-    assert not Context.create(camera, CONFIG).tracks_patches
+def test_cameras_are_tracked_by_patches_or_by_features(corridor):
+    for camera in (corridor.camera, replace(corridor.camera, depth=True)):
+        assert Context.create(camera, Config()).tracks_patches
     assert Context.create(corridor.camera.left_camera(), CONFIG).tracks_patches
-    assert Context.create(corridor.camera, Config()).tracks_patches
     assert not Context.create(corridor.camera.left_camera(), Config()).tracks_patches
     assert not Context.create(corridor.camera, FEATURES).tracks_patches

@@ -15,7 +15,9 @@ from vslam.cli.main import every_command
 from vslam.config import Config, DepthConfig, KeyframeConfig
 from vslam.datasets import open_sequence
 from vslam.datasets.association import Pairing, associate
-from vslam.datasets.perturbation import parse_perturbation
+from vslam.datasets.frames import TimedFrame
+from vslam.datasets.perturbation import Perturbation, parse_perturbation
+from vslam.datasets.perturbation.laws import perturbed
 from vslam.datasets.tum import open_tum
 from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.frontend.depth import columns_of_depth
@@ -130,17 +132,31 @@ def test_features_without_depth_are_monocular(corridor):
     assert 100 < np.count_nonzero(known) < len(known) - 100
     found = camera.bf / (features.xy[known, 0] - features.u_right[known])
     np.testing.assert_allclose(found, depth[rows, columns][known], rtol=1e-3)
-    assert extracted.pyramid is None  # no pyramid, because matches are not aligned
 
 
-def test_matches_are_not_aligned_if_the_depth_image_cannot_be_read(corridor):
+def test_added_features_get_their_depth_too(corridor):
+    camera = replace(corridor.camera, depth=True)
+    context = Context.create(camera, Config())
+    depth = corridor_depth(camera, corridor.T_wc[0]).astype(np.float32)
+    images = FrameImages(corridor.left[0], lambda: depth, context)
+    xy = np.stack(np.meshgrid([101.0, 203.0, 301.0], [60.0, 90.0]), axis=-1).reshape(-1, 2)
+    at = xy.astype(np.float32), np.zeros(len(xy), np.uint8)
+    before, after = images.extracted.features, images.extracted_with(at).features
+    assert len(after) > len(before)
+    known = np.isfinite(after.u_right)
+    rows, columns = np.rint(after.xy).astype(int).T[::-1]
+    found = camera.bf / (after.xy[:, 0] - after.u_right)[known]
+    np.testing.assert_allclose(found, depth[rows, columns][known], rtol=1e-3)
+
+
+def test_features_have_no_depth_if_the_depth_image_cannot_be_read(corridor):
     def read_depth():
         raise UnreadableImageError(Path("depth.png"), "cannot be decoded; download it again.")
 
     context = Context.create(replace(corridor.camera, depth=True), Config())
     extracted = FrameImages(corridor.left[0], read_depth, context).extracted
     assert np.isnan(extracted.features.u_right).all()
-    assert extracted.pyramid is None
+    assert extracted.problem is not None
 
 
 def test_a_corner_at_an_edge_of_depth_has_none():
@@ -198,6 +214,10 @@ def test_light_does_not_change_depth():
     left, second = parse_perturbation("noise:2,blur", 0).apply(0, 0.0, grey, depth)
     assert (left != grey).any()
     assert second is depth
+    frame = TimedFrame(0.0, lambda _: (grey, depth), (lambda: grey, lambda: depth))
+    (apart,) = perturbed(iter([frame]), parse_perturbation("noise:2,blur", 0))
+    np.testing.assert_array_equal(apart.sides[0](), left)
+    assert apart.sides[1]() is depth
 
 
 # TUM's layout
@@ -390,6 +410,38 @@ def test_a_run_is_accurate(outcome):
     assert all(track.state == "OK" for track in outcome.tracks)
     assert outcome.n_submaps == 1
     assert ate_of(outcome) < 0.02  # of 5 m; stereo has 0.01
+
+
+def test_depth_is_decoded_for_keyframes_and_frames_tracked_by_features_alone(tree):
+    reads = []
+
+    def counted(frame):
+        def depth():
+            reads.append(frame.timestamp)
+            return frame.sides[1]()
+
+        return replace(frame, sides=(frame.sides[0], depth))
+
+    source = open_tum(tree, "")
+    source = replace(source, stored=tuple(map(counted, source.stored)))
+    settings = RunOptions(detector="none", threads=1)
+    tracks = run_sequence(begin(source, settings), Perturbation("none"), Recorder()).tracks
+    assert sorted(reads) == [track.timestamp for track in tracks if track.n_features]
+    assert len(reads) < FRAMES / 2
+
+
+def test_of_many_visible_landmarks_some_are_searched_for_evenly(corridor, monkeypatch):
+    monkeypatch.setattr("vslam.frontend.patch_tracking._ENOUGH", 100)
+    camera = replace(corridor.camera, depth=True)
+    slam = Slam(camera, Config(), "none", threads=1)
+    for k in range(4):
+        depth = corridor_depth(camera, corridor.T_wc[k]).astype(np.float32)
+        result = slam.step(corridor.left[k], depth, corridor.timestamps[k])
+    view = slam._session.published.view
+    assert view.patch_stride > 1
+    assert view.with_patches.ids.tolist() == view.patches.ids[:: view.patch_stride].tolist()
+    assert result.n_features == 0
+    assert 50 < result.n_inliers < 150
 
 
 def test_the_result_does_not_depend_on_the_threads(outcome, tree):

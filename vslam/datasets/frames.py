@@ -48,7 +48,7 @@ class TimedFrame:
             uint8. For RGB-D, it is the depth of the left image's pixels, ``(H, W)`` float32
             metres, 0 where the depth is unknown. For a monocular source, it is None.
         sides: a function that decodes only the left image, and a function that decodes only the
-            right image. None if both images can only be decoded together, or if there is no right
+            second image. None if both images can only be decoded together, or if there is no second
             image.
         file: file of the left image. None if the image has no file of its own, or if it has to be
             rectified or converted to 8 bits.
@@ -61,7 +61,7 @@ class TimedFrame:
 
     timestamp: float
     read: Callable[[ImageMap], Images]
-    sides: tuple[Callable[[], Image], Callable[[], Image]] | None = None
+    sides: tuple[Callable[[], Image], Callable[[], Image | DepthImage]] | None = None
     file: Path | None = None
     colour: Callable[[], NDArray[np.uint8]] | None = None
     name: str | None = None

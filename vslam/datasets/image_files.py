@@ -87,7 +87,7 @@ def checked_files(
         return TimedFrame(
             timestamp,
             partial(decoded, decoders),
-            sides=(grey[0], grey[1]) if len(grey) == 2 else None,
+            sides=(grey[0], decoders[1]) if len(decoders) == 2 else None,
             file=files[0] if levels is None else None,
             colour=partial(read_colour, files[0], levels),
             name=files[0].name,

@@ -110,10 +110,10 @@ def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFr
         colour = partial(_read_one, frame.colour, rectification.left)
     sides = None
     if frame.sides is not None:
-        left, right = frame.sides
+        left, second = frame.sides
         sides = (
             partial(_read_one, left, rectification.left),
-            partial(_read_one, right, rectification.right),
+            partial(_read_second, second, rectification),
         )
     read = partial(_read, rectification, frame)
     return replace(frame, read=read, sides=sides, file=file, colour=colour)
@@ -122,11 +122,21 @@ def _rectified_frame(rectification: Rectification, frame: TimedFrame) -> TimedFr
 def _read(rectification: Rectification, frame: TimedFrame, image_map: ImageMap) -> Images:
     left, second = frame.read(image_map)
     sides: list[Callable[[], Image | DepthImage]] = [partial(rectification.left, left)]
-    if second is not None and rectification.camera.depth:
-        sides.append(partial(rectification.left_depth, second))
-    elif second is not None:
-        sides.append(partial(rectification.right, np.asarray(second, np.uint8)))
+    if second is not None:
+        sides.append(partial(_second, second, rectification))
     return decoded(sides, image_map)
+
+
+def _read_second(
+    read: Callable[[], Image | DepthImage], rectification: Rectification
+) -> Image | DepthImage:
+    return _second(read(), rectification)
+
+
+def _second(image: Image | DepthImage, rectification: Rectification) -> Image | DepthImage:
+    if rectification.camera.depth:
+        return rectification.left_depth(image)
+    return rectification.right(np.asarray(image, np.uint8))
 
 
 def _read_one(

@@ -76,11 +76,11 @@ class Mapper:
         Returns:
             The frame with all landmarks of its keyframe.
         """
-        published, closing, config = self.published, self._closing, self._context.config
+        published, closing = self.published, self._closing
         (track,) = published.complete(track)
         with published.change() as map_:
             track = self._make_room(map_, track)
-            certainty = certainty_of(track, config.alignment)
+            certainty = certainty_of(track, self._context)
             keyframe = add_frame(map_, track, certainty, published.reference, predicted=predicted)
             map_stereo_points(map_, keyframe, self._context)
             refresh_keyframe(map_, keyframe)
@@ -187,7 +187,7 @@ class Mapper:
         """Make an existing keyframe the reference keyframe instead of inserting a new keyframe."""
         published = self.published
         with published.change() as map_:
-            certainty = certainty_of(track, self._context.config.alignment)
+            certainty = certainty_of(track, self._context)
             new = add_revisit(map_, place.keyframe, track, certainty)
         published.refer_to_known(place.keyframe, track)
         if self._closing.count_reused_keyframe(map_, new=new):

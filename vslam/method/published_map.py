@@ -18,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from vslam.backend.disparity_offset import offset_sigma
+from vslam.frontend.patch_tracking import stride_of
 from vslam.frontend.patches import RecentPatches, patches_of_frame, patches_of_landmarks
 from vslam.method.closing import LoopClosing, LoopSearch
 from vslam.method.hypotheses import part_of
@@ -240,8 +241,9 @@ class PublishedMap:
             T_cw = self.frames.pose(place.frame)
             patches = patches_of_landmarks(place, local.ids, T_cw, map_.scales)
         monocular = self._context.camera.monocular
+        stride = stride_of(patches, local, map_.keyframe_pose(keyframe), self._context)
         self.view = replace(
-            view_of(map_, keyframe, local, patches, monocular=monocular),
+            view_of(map_, keyframe, local, patches, stride, monocular=monocular),
             part=part_of(map_, self._closing.closed, keyframe),
             offset_sigma=offset_sigma(map_.scalars.offset_information, config.stereo),
         )

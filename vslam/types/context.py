@@ -15,6 +15,9 @@ _DEPTH_MOTION_WINDOW = 15.0
 # Replaces `local_window` for an RGB-D camera, in pixels at octave 0. ORB-SLAM2 uses 7.5. [OS1
 # V-D, own]
 _DEPTH_LOCAL_WINDOW = 5.0
+# Replaces `alignment.certainty` for an RGB-D camera. Its rolling shutter moves points by about half
+# a pixel, which alignment does not correct. [own]
+_DEPTH_CERTAINTY = 1
 
 
 def scale_factors(config: OrbConfig) -> NDArray[np.float64]:
@@ -40,15 +43,14 @@ class Context:
 
     @property
     def tracks_patches(self) -> bool:
-        """Whether frames are tracked using image patches when possible.
+        """Whether frames are tracked using image patches when possible."""
+        method = self.config.tracking.method
+        return not self.camera.monocular if method == "auto" else method == "patches"
 
-        For RGB-D cameras, patch-based tracking is less accurate and not faster
-        (docs/research/performance.md).
-        """
-        method, camera = self.config.tracking.method, self.camera
-        if method == "auto":
-            return camera.sensor == "stereo"
-        return method == "patches" and not camera.depth
+    @property
+    def aligned_certainty(self) -> int:
+        """Variance of a keypoint's position, divided by that of an aligned match or patch."""
+        return _DEPTH_CERTAINTY if self.camera.depth else self.config.alignment.certainty
 
     @property
     def close_depth(self) -> float:

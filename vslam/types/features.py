@@ -203,6 +203,16 @@ class LandmarkPatches(NamedTuple):
     shift: NDArray[np.float32]
     T_cw: NDArray[np.float64]
 
+    def every(self, stride: int) -> LandmarkPatches:
+        """Return the patches of every ``stride``-th landmark."""
+        return self._replace(
+            ids=self.ids[::stride],
+            where=self.where[::stride],
+            view=self.view[::stride],
+            size=self.size[::stride],
+            angle=self.angle[::stride],
+        )
+
 
 NO_PATCHES = LandmarkPatches(
     np.empty(0, np.int32),

@@ -89,7 +89,9 @@ class MapView:
         n_reference: number of ``reference_landmarks`` that at least three keyframes observe. If the
             map has fewer than three keyframes, all of its keyframes must observe the landmark.
         patches: image patches of the local landmarks that the newest keyframes observe.
-        with_patches: the landmarks that have patches, in the same order as in ``patches``.
+        searched: every ``patch_stride``-th of these patches, which tracking searches for.
+        with_patches: the landmarks of these patches, in the same order as in ``searched``.
+        patch_stride: see above. It is 1 unless many landmarks are visible.
         disparity_offset: offset that is added to every measured disparity, in pixels.
         offset_sigma: standard deviation of ``disparity_offset``, in pixels.
         part: index of the part of the map that contains the reference keyframe
@@ -104,26 +106,36 @@ class MapView:
     reference_landmarks: LocalMap = NO_LANDMARKS
     n_reference: int = 0
     patches: LandmarkPatches = NO_PATCHES
+    searched: LandmarkPatches = NO_PATCHES
     with_patches: LocalMap = NO_LANDMARKS
+    patch_stride: int = 1
     disparity_offset: float = 0.0
     offset_sigma: float = 0.0
     part: int = 0
 
 
 def view_of(
-    map_: Map, keyframe: int, local: LocalMap, patches: LandmarkPatches, *, monocular: bool
+    map_: Map,
+    keyframe: int,
+    local: LocalMap,
+    patches: LandmarkPatches,
+    patch_stride: int,
+    *,
+    monocular: bool,
 ) -> MapView:
     """Create the view of the map for a reference keyframe.
 
     Args:
         local: the landmarks of the keyframe and of its covisible keyframes.
         patches: image patches of those landmarks that the newest keyframes observe.
+        patch_stride: see ``MapView``.
     """
     living = map_.living_keyframes()
     if monocular and map_.restarts:
         # A new sub-map counts as a young map: the monocular keyframe decision depends on it.
         living = living[living >= map_.restarts[-1]]
-    at = np.searchsorted(local.ids, patches.ids)
+    searched = patches.every(patch_stride)
+    at = np.searchsorted(local.ids, searched.ids)
     return MapView(
         reference=keyframe,
         T_reference=map_.keyframe_pose(keyframe),
@@ -133,6 +145,8 @@ def view_of(
         reference_landmarks=local_map(map_, keyframe, 1),
         n_reference=count_seen_by(map_.arrays, keyframe, min(3, len(living))),
         patches=patches,
+        searched=searched,
+        patch_stride=patch_stride,
         with_patches=LocalMap._make(values[at] for values in local),
         disparity_offset=map_.scalars.disparity_offset,
     )

@@ -151,20 +151,29 @@ def perturbed(frames: Iterator[TimedFrame], perturbation: Perturbation) -> Itera
         read = partial(_read_perturbed, frame, perturbation, index, t)
         sides = None
         if frame.sides is not None and not pair_needed:
-            left, right = frame.sides
+            left, second = frame.sides
             sides = (
-                partial(_read_side, left, laws, index, t, 0),
-                partial(_read_side, right, laws, index, t, 1),
+                partial(_read_left, left, laws, index, t),
+                partial(_read_second, second, laws, index, t),
             )
         yield TimedFrame(frame.timestamp, read, sides, mask=frame.mask)
 
 
-def _read_side(
-    read: Callable[[], Image], laws: list[EachSide], index: int, t: float, side: int
-) -> Image:
+def _read_left(read: Callable[[], Image], laws: list[EachSide], index: int, t: float) -> Image:
     image = read()
     for each in laws:
-        image = each.law(index, t, side, image)
+        image = each.law(index, t, 0, image)
+    return image
+
+
+def _read_second(
+    read: Callable[[], Image | DepthImage], laws: list[EachSide], index: int, t: float
+) -> Image | DepthImage:
+    image = read()
+    if image.dtype != np.uint8:
+        return image  # depth is not changed
+    for each in laws:
+        image = each.law(index, t, 1, np.asarray(image, np.uint8))
     return image
 
 

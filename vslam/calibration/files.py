@@ -28,7 +28,7 @@ CALIBRATION = "calibration.yaml"
 
 NEEDED_CALIBRATION = (
     "give a file with the cameras' focal lengths, centres, distortion and, for two cameras, "
-    "baseline (docs/howto/cameras.md)"
+    "baseline (docs/howto/cameras.md), or --calib auto for one camera"
 )
 """What to do if there is no calibration, for error messages."""
 

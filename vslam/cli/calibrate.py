@@ -15,7 +15,7 @@ from vslam.cli.console import Console
 from vslam.cli.options import flag, open_given, option, reads_source, require_data
 from vslam.support.errors import BrokenSourceError, InputError, ResultsError
 from vslam.support.options import METHOD, OUTPUT
-from vslam.types.source_options import LIVE
+from vslam.types.source_options import AUTO, LIVE
 
 if TYPE_CHECKING:
     from vslam.calibration.boards import Board
@@ -29,6 +29,7 @@ _EXAMPLES = """
   vslam calibrate board.mp4 --board checkerboard --size 9x6 --square 0.025
   vslam calibrate pair.mkv --side-by-side --board charuco --size 7x5 --square 0.04 --marker 0.03
   vslam calibrate cam_april/mav0 --board april_6x6.yaml --lens fisheye --out stereo.yaml
+  vslam calibrate drive.mp4 --auto --out camera.yaml
   vslam calibrate drive.mp4 --imu --side-by-side --calib stereo.yaml
 """
 _MOST_SEARCHED = 300  # images, which are spread evenly over the source; this takes 1 to 2 minutes
@@ -109,16 +110,28 @@ def calibrate(
             "--imu",
         ),
     ] = False,
+    auto: Annotated[
+        bool,
+        flag(
+            METHOD,
+            "Calibrate one camera from a drive, without a board, as --calib auto does.",
+            "--auto",
+        ),
+    ] = False,
 ) -> None:
-    """Calibrate a camera or a stereo pair from images of a calibration board, or an IMU from a
-    drive in which the camera turns about all axes.
+    """Calibrate a camera or a stereo pair from images of a calibration board, one camera from any
+    drive, or an IMU from a drive in which the camera turns about all axes.
 
     The exit code is 1 if the calibration has faults.
     """
-    if imu:
-        of_board = {"--board": board, "--size": size, "--square": square, "--marker": marker}
+    of_board = {"--board": board, "--size": size, "--square": square, "--marker": marker}
+    if imu and auto:
+        raise InputError("--auto: calibrates a camera, --imu an IMU; leave one of them out.")
+    if imu or auto:
         for name in filter(of_board.get, of_board):
-            raise InputError(f"{name}: an IMU is calibrated without a board; leave it out.")
+            what = "an IMU is calibrated" if imu else "--auto calibrates"
+            raise InputError(f"{name}: {what} without a board; leave it out.")
+    if imu:
         _calibrate_imu(given, out)
         return
     from vslam.calibration.boards import other_board
@@ -131,8 +144,14 @@ def calibrate(
     for name in _OF_DRIVES:
         if getattr(given, name) not in (None, "", ()):
             raise InputError(f"--{name.replace('_', '-')}: only with --imu; leave it out.")
+    if auto:
+        _calibrate_from_motion(given, out or _DEFAULT_OUT)
+        return
     if not board:
-        raise InputError("--board is missing: give a board, or --imu to calibrate an IMU.")
+        raise InputError(
+            "--board is missing: give a board, --auto to calibrate one camera without a board, or "
+            "--imu to calibrate an IMU."
+        )
     if given.sensor == "rgbd":
         raise InputError("--sensor rgbd: depth cameras cannot be calibrated; give mono or stereo.")
     out = out or _DEFAULT_OUT
@@ -171,6 +190,24 @@ def calibrate(
     typer.echo("Next, with a drive:")
     for command in ("doctor", "run"):
         typer.echo(f"  vslam {command} DRIVE{options} --calib {shlex.quote(str(out))}")
+
+
+def _calibrate_from_motion(given: SourceOptions, out: Path) -> None:
+    from vslam.calibration.files import write_calibration
+    from vslam.datasets.sources import open_source
+
+    _check_place(out)
+    Console(shown=True).announce("calibrating the camera from its own images ...")
+    source = open_source(given.model_copy(update={"calib": AUTO}))
+    for sentence in source.warnings:
+        typer.echo(sentence.removeprefix("--calib auto: "))
+    assert source.calibration is not None
+    _keep_earlier(out)
+    write_calibration(out, source.calibration)
+    typer.echo(f"{out}: the calibration.")
+    typer.echo("Next, with a drive:")
+    for command in ("doctor", "run"):
+        typer.echo(f"  vslam {command} DRIVE --sensor mono --calib {shlex.quote(str(out))}")
 
 
 def _calibrate_imu(given: SourceOptions, out: Path | None) -> None:

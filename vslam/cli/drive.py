@@ -14,6 +14,7 @@ from vslam.cli.console import Console
 from vslam.cli.options import open_given
 from vslam.run.warmup import Compilation
 from vslam.support.errors import InputError, ResultsError
+from vslam.types.source_options import AUTO
 
 if TYPE_CHECKING:
     from vslam.datasets.fixes import Fixes
@@ -221,6 +222,7 @@ def _compile(settings: RunOptions, console: Console, kernels: Compilation) -> No
 def _new_folder(
     options: RunOptions, source: Source, perturb: str, out: Path, lock: ExitStack
 ) -> Path:
+    from vslam.calibration.files import CALIBRATION, write_calibration
     from vslam.config import changed_thresholds
     from vslam.report.folder import create_run_folder
     from vslam.run.autosave import lock_run
@@ -229,6 +231,10 @@ def _new_folder(
     changed = changed_thresholds(options.thresholds.model_dump())
     folder = create_run_folder(out, source.dataset, source.name, perturb, options.detector, changed)
     lock.enter_context(lock_run(folder))
+    if options.calib == AUTO and source.calibration is not None:
+        file = folder / CALIBRATION
+        write_calibration(file, source.calibration)
+        options = options.model_copy(update={"calib": (file,), "sensor": "mono"})
     write_options(folder, options)
     return folder
 

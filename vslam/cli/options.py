@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 from vslam.run.options import PERTURB, SEED, THRESHOLDS
 from vslam.support.errors import InputError
 from vslam.support.options import EXECUTION, INPUT, METHOD, OUTPUT, Option, options_of
-from vslam.types.source_options import DEPTH_CAMERAS, SourceOptions
+from vslam.types.source_options import AUTO, DEPTH_CAMERAS, SourceOptions
 
 if TYPE_CHECKING:
     from vslam.cli.console import Console
@@ -302,6 +302,8 @@ def open_given(options: SourceOptions, console: Console) -> Source:
     from vslam.datasets.sources import open_source
 
     require_data(options)
+    if options.calib == AUTO:
+        console.announce("calibrating the camera from its own images ...")
     with console.render_bar() as on_render:
         return open_source(options, on_render)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from vslam.calibration.files import NEEDED_CALIBRATION, read_calibration
 from vslam.calibration.models import Calibration
 from vslam.datasets import open_sequence
+from vslam.datasets.auto_calibration import calibrate_source, single_camera
 from vslam.datasets.detection import detect_dataset
 from vslam.datasets.frames import RawSource, Source, selected
 from vslam.datasets.image_files import depth_scale_of, list_images
@@ -19,7 +20,7 @@ from vslam.datasets.kitti_raw import is_kitti_raw
 from vslam.datasets.masks import with_masks
 from vslam.datasets.rectified import rectified
 from vslam.support.errors import InputError
-from vslam.types.source_options import DEPTH_CAMERAS, SOURCES, SourceOptions
+from vslam.types.source_options import AUTO, DEPTH_CAMERAS, SOURCES, SourceOptions
 
 _APPLIES_TO = {
     "right": ("images",),
@@ -49,6 +50,8 @@ def open_source(
     """
     o = options
     dataset = o.dataset or detect_dataset(o.data)
+    if o.calib == AUTO:
+        o = single_camera(dataset, o)
     _check_options(dataset, o)
     source: Source
     if dataset in SOURCES:
@@ -81,11 +84,23 @@ def _open_images(dataset: str, options: SourceOptions) -> Source:
             Path(o.data), o.right, depth=o.depth, fps=o.fps, start=o.start, every=o.every,
             max_frames=o.max_frames, sensor=o.sensor,
         )  # fmt: skip
+        if o.calib == AUTO:
+            return _calibrated(replace(found.source(), imu=_imu_beside(Path(o.data))), o.data)
         calibration = _calibration(dataset, o, found.size)
         scale = depth_scale_of(o.depth_scale, calibration.depth_scale)
         return rectified(replace(found.source(scale), imu=_imu_beside(Path(o.data))), calibration)
     raw, own = _open_stream(dataset, o, monocular)
+    if o.calib == AUTO:
+        return _calibrated(raw, o.data)
     return rectified(raw, _calibration(dataset, o, raw.sizes[0], own))
+
+
+def _calibrated(raw: RawSource, data: str) -> Source:
+    """Rectify the images of one camera, which is calibrated from its motion."""
+    found = calibrate_source(raw, data)
+    source = rectified(raw, Calibration(found.camera, source=f"{data}: --calib auto"))
+    notes = f"--calib auto: {found}.", *(f"--calib auto: {text}" for text in found.warnings())
+    return replace(source, warnings=(*source.warnings, *notes))
 
 
 def open_raw(options: SourceOptions) -> RawSource:

@@ -14,6 +14,8 @@ DATASETS = ("kitti", "kitti_raw", "euroc", "tum", "synthetic")  # plug-ins may a
 DEPTH_CAMERAS = ("realsense", "oakd")
 LIVE = ("camera", *DEPTH_CAMERAS)
 SOURCES = ("images", "video", "bag", *LIVE)
+AUTO = (Path("auto"),)
+"""The calibration files if the camera is to be calibrated from the images of the source."""
 
 
 def source_names() -> tuple[str, ...]:
@@ -32,7 +34,7 @@ class SourceOptions(BaseModel):
         dataset: one of `DATASETS` or of `SOURCES`, or the name of a data set that a plug-in reads.
             None detects the data set from ``data``.
         seq: name of the sequence of a data set, see `vslam.datasets.open_sequence`.
-        calib: calibration files, see `vslam.calibration.files.read_calibration`.
+        calib: calibration files, see `vslam.calibration.files.read_calibration`, or `AUTO`.
         right: folder of the right images.
         depth: folder of the depth images.
         fps: frames per second. If it is given, the time stamps of the source are not used.
@@ -84,7 +86,8 @@ class SourceOptions(BaseModel):
             INPUT,
             "FILE",
             "Calibration file (docs/howto/cameras.md). If each camera has its own file, give the "
-            "option twice, the left camera first.",
+            "option twice, the left camera first. [b]auto[/b] calibrates one camera from its own "
+            "images (docs/howto/calibrate.md).",
             given_as=list[Path],
         ),
     ] = ()

@@ -1,0 +1,153 @@
+"""``--calib auto``: the camera is estimated from followed corners, or its motion is refused."""
+
+from __future__ import annotations
+
+import json
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vslam.calibration.chains import KEYFRAMES, Chain
+from vslam.calibration.files import read_calibration
+from vslam.calibration.from_motion import MotionFit, camera_from_chains
+from vslam.calibration.models import CameraModel, project
+from vslam.support.errors import InputError
+from vslam_lab.towns import Variation, route_named
+from vslam_lab.towns.passes import Passes
+from vslam_lab.towns.render import Renderer, sensor_image
+from vslam_lab.towns.rooms import build_room
+
+SIZE = (640, 480)
+PINHOLE = CameraModel(430.0, 430.0, 319.5, 239.5, *SIZE, "pinhole", (-0.12, 0.03, 0.0, 0.0))
+FISHEYE = CameraModel(250.0, 250.0, 319.5, 239.5, *SIZE, "fisheye", (0.02, -0.01, 0.0, 0.0))
+
+
+def chain(
+    model: CameraModel,
+    seed: int,
+    *,
+    turn: float = 0.25,
+    sideways: float = 0.6,
+    ahead: float = 0.2,
+    flat: bool = False,
+    read_out: float = 0.0,
+) -> Chain:
+    """Project points of a room while the camera moves, with noise of 0.2 pixels."""
+    rng = np.random.default_rng(seed)
+    rays = rng.uniform(-1.0, 1.0, (300, 3)) * [1.6, 1.2, 0.0] + [0.0, 0.0, 1.0]
+    points = rays * (4.0 if flat else rng.uniform(2.0, 9.0, (300, 1)))
+    axis, way = rng.normal(size=3), rng.normal(size=3) * [sideways, sideways, 0.0]
+    axis /= np.linalg.norm(axis)
+    way[2] += ahead
+
+    def seen(time: np.ndarray | float) -> np.ndarray:
+        bend = np.sin(np.asarray(time) * 1.3)[..., None]
+        R = Rotation.from_rotvec(turn * np.asarray(time)[..., None] * axis + 0.3 * turn * bend)
+        moved = R.apply(points) + np.asarray(time)[..., None] * way
+        return project(model, moved)
+
+    xy, flow = [], []
+    for time in np.linspace(0.0, 1.0, KEYFRAMES):
+        step = rng.uniform(0.0, 0.08)  # between two frames: the camera moves unevenly
+        at = seen(np.full(300, time))
+        rows = (at[:, 1] - 239.5) / SIZE[1]
+        xy.append(seen(time + read_out * step * rows))
+        flow.append(xy[-1] - seen(time - step + read_out * step * rows))
+    positions = np.array(xy) + rng.normal(0.0, 0.2, (KEYFRAMES, 300, 2))
+    inside = ((positions > 0) & (positions < SIZE)).all(axis=2)
+    positions[~inside] = np.nan
+    kept = inside[:3].all(axis=0)
+    return Chain(0.0, positions[:, kept], np.array(flow)[:, kept])
+
+
+def found(model: CameraModel, n: int = 6, **motion) -> MotionFit:
+    return camera_from_chains([chain(model, seed, **motion) for seed in range(n)], SIZE, "clip")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [PINHOLE, FISHEYE])
+def test_focal_length_and_lens_are_found_within_the_stated_deviation(model):
+    fit = found(model)
+    assert fit.camera.lens == model.lens
+    assert abs(fit.camera.fx / model.fx - 1.0) < max(3.0 * fit.sigma, 0.002)
+    assert fit.sigma < 0.01
+    assert fit.warnings() == []
+
+
+@pytest.mark.slow
+def test_a_rolling_shutter_is_recognised_and_does_not_bias_the_focal_length():
+    fit = found(PINHOLE, read_out=0.8)
+    assert fit.read_out == pytest.approx(0.8, abs=0.1)
+    assert abs(fit.camera.fx / PINHOLE.fx - 1.0) < max(3.0 * fit.sigma, 0.002)
+    assert "rolling shutter" in fit.warnings()[0]
+
+
+@pytest.mark.slow
+def test_a_zoom_is_recognised():
+    wide, narrow = PINHOLE, replace(PINHOLE, fx=520.0, fy=520.0)
+    chains = [chain(wide if k < 4 else narrow, k) for k in range(8)]
+    fit = camera_from_chains(chains, SIZE, "clip")
+    assert "the lens zooms" in fit.warnings()[0]
+    assert fit.zoomed > 0.1
+
+
+@pytest.mark.slow
+def test_motion_that_does_not_tell_the_focal_length_is_refused_with_the_reason():
+    with pytest.raises(InputError, match=r"^clip: the camera moves straight ahead"):
+        found(PINHOLE, turn=0.0, sideways=0.0, ahead=0.9)
+    with pytest.raises(InputError, match=r"^clip: corners cannot be followed.*cameras\.md"):
+        camera_from_chains([], SIZE, "clip")
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> Path:
+    """A video of a walk through a room, with a focal length of 300 pixels."""
+    file = tmp_path_factory.mktemp("clip") / "clip.avi"
+    variation = Variation(5)
+    route = route_named("room", variation)
+    camera = replace(route.camera, width=384, height=288, fx=300.0, fy=300.0, cx=191.5, cy=143.5)
+    town = build_room(route.land, variation)
+    passes = Passes(route, town, variation)
+    video = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (384, 288))
+    with closing(Renderer(camera, town.atlas, town.sky)) as renderer:
+        for k in range(0, 160, 2):
+            (view,) = renderer.views(passes.at(k), route.T_wc[k])
+            image = sensor_image(view.image, camera, yaw_rate=0.0, night=0.0, key=(5, k, 0))
+            video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    video.release()
+    return file
+
+
+@pytest.mark.slow
+def test_from_a_video_to_a_splat_in_two_commands_without_a_calibration(clip, tmp_path, call):
+    code, _, err = call("run", clip, "--calib", "auto", "--no-record", "--out", tmp_path / "runs")
+    assert code == 0, err
+    folder = (tmp_path / "runs" / "latest").resolve()
+    model = read_calibration([folder / "calibration.yaml"]).left
+    assert model.fx == pytest.approx(300.0, rel=0.02)
+    report = json.loads((folder / "report.json").read_text())
+    assert any("focal length" in text for text in report["warnings"])
+    code, _, err = call("export", "nerfstudio", folder)
+    assert code == 0, err
+    scene = json.loads((folder / "nerfstudio" / "transforms.json").read_text())
+    assert len(scene["frames"]) > 5
+    code, out, _ = call("calibrate", clip, "--auto", "--out", tmp_path / "camera.yaml")
+    assert code == 0
+    assert "standard deviation" in out
+    assert read_calibration([tmp_path / "camera.yaml"]).left == model  # the same images
+
+
+def test_auto_calibrates_one_recorded_camera(clip, call):
+    for options, what in (
+        (["--side-by-side"], "one camera"),
+        (["--dataset", "synthetic"], "has its own calibration"),
+        (["--dataset", "camera"], "record a video"),
+    ):
+        code, _, err = call("run", clip, "--calib", "auto", *options)
+        assert code == 2
+        assert what in err

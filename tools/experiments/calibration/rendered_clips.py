@@ -1,0 +1,129 @@
+"""Measure how well `--calib auto` knows the focal length of rendered clips, and its own error.
+
+    python tools/experiments/calibration/rendered_clips.py --clips 100 --seed 60 --out clips.csv
+
+Each clip has another path, field of view (45 to 100 degrees) and radial distortion (half of the
+clips have none). ``error`` is the relative error of the focal length, ``sigma`` its stated standard
+deviation. The last line counts the clips whose error is at most two standard deviations.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from vslam.calibration.from_motion import camera_from_motion
+from vslam.calibration.models import CameraModel, unproject
+from vslam.support.errors import InputError
+from vslam.types.camera import Camera, Image
+from vslam_lab.towns import Variation, route_named
+from vslam_lab.towns.passes import Passes
+from vslam_lab.towns.render import Renderer, sensor_image
+from vslam_lab.towns.rooms import SIZES, build_room
+from vslam_lab.towns.town import build_town
+
+FAMILIES = ("room", "walk", "hall", "drone", "demo")
+SIZE = (384, 288)
+FRAMES = 80
+
+
+def camera_of(seed: int) -> CameraModel:
+    rng = np.random.default_rng([seed, 72])
+    focal = SIZE[0] / 2.0 / np.tan(np.radians(rng.uniform(45.0, 100.0)) / 2.0)
+    corner = float(np.hypot(*SIZE)) / 2.0 / focal
+    k1 = rng.uniform(-0.15, 0.1) / max(corner, 1.0) ** 2 if rng.uniform() < 0.5 else 0.0
+    centre = (SIZE[0] - 1) / 2.0, (SIZE[1] - 1) / 2.0
+    return CameraModel(focal, focal, *centre, *SIZE, "pinhole", (k1, 0.0, 0.0, 0.0))
+
+
+def wide_camera(model: CameraModel, rays: np.ndarray) -> Camera:
+    """Return the pinhole camera of which an image shows all rays."""
+    reach = np.abs(rays[..., :2] / rays[..., 2:]).reshape(-1, 2).max(axis=0)
+    width, height = (2 * np.ceil(model.fx * reach) + 5).astype(int).tolist()
+    return Camera(model.fx, model.fy, (width - 1) / 2, (height - 1) / 2, 0.0, width, height)
+
+
+def clip(family: str, seed: int, model: CameraModel) -> Iterator[tuple[float, Image]]:
+    u, v = np.meshgrid(np.arange(model.width), np.arange(model.height))
+    rays = unproject(model, np.stack([u, v], axis=-1).reshape(-1, 2).astype(float))
+    rays = rays.reshape(model.height, model.width, 3)
+    camera = wide_camera(model, rays)
+    x = (camera.fx * rays[..., 0] / rays[..., 2] + camera.cx).astype(np.float32)
+    y = (camera.fy * rays[..., 1] / rays[..., 2] + camera.cy).astype(np.float32)
+    variation = Variation(seed)
+    route = replace(route_named(family, variation), camera=camera)
+    inside = route.land in SIZES
+    town = build_room(route.land, variation) if inside else build_town(route, variation)
+    passes = Passes(route, town, variation)
+    start = 60 if family in ("hall", "drone") else 20
+    every = 1 if family == "demo" else 2
+    with closing(Renderer(camera, town.atlas, town.sky)) as renderer:
+        for k in range(start, min(start + every * FRAMES, len(route.T_wc)), every):
+            moment = passes.at(k)
+            (view,) = renderer.views(moment, route.T_wc[k])
+            image = sensor_image(
+                view.image, camera, yaw_rate=float(route.yaw_rate[k]),
+                pitch_rate=float(route.pitch_rate[k]), night=moment.night, key=(seed, k, 0),
+            )  # fmt: skip
+            yield k / route.rate, np.asarray(cv2.remap(image, x, y, cv2.INTER_CUBIC), np.uint8)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--clips", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=60, help="seed of the first clip")
+    parser.add_argument("--out", type=Path, help="CSV file to write")
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    rows = []
+    for seed in range(args.seed, args.seed + args.clips):
+        family, model = FAMILIES[seed % len(FAMILIES)], camera_of(seed)
+        row: dict[str, object] = {
+            "clip": f"{family}+seed:{seed}",
+            "focal": round(float(model.fx), 1),
+            "k1": round(model.distortion[0], 3),
+        }
+        begun = time.process_time()
+        try:
+            fit = camera_from_motion(clip(family, seed, model), SIZE, "clip")
+            error = float(fit.camera.fx / model.fx - 1.0)
+            row |= {
+                "found": round(fit.camera.fx, 1),
+                "error": round(error, 4),
+                "sigma": round(fit.sigma, 4),
+                "sigmas": round(abs(error) / fit.sigma, 2),
+                "chains": fit.chains,
+                "lens": fit.camera.lens,
+                "read_out": round(fit.read_out, 2),
+            }
+        except InputError as refusal:
+            row |= {"refused": str(refusal).partition(": ")[2].partition(", so")[0]}
+        row["cpu_s"] = round(time.process_time() - begun, 1)
+        rows.append(row)
+        print(row, flush=True)
+    told = [row for row in rows if "sigma" in row]
+    good = sum(float(str(row["sigmas"])) <= 2.0 for row in told)
+    print(
+        f"{good} of {len(told)} within two standard deviations, {len(rows) - len(told)} refused, "
+        f"median error {np.median([abs(float(str(row['error']))) for row in told]):.4f}"
+    )
+    if args.out is not None:
+        keys = list(dict.fromkeys(key for row in rows for key in row))
+        with args.out.open("w", newline="") as file:
+            writer = csv.DictWriter(file, keys)
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -35,22 +35,55 @@ def adjust_two_views(
         ``(4, 4)`` ``T_2_1``; ``(N, 3)`` points in the frame of camera 1; ``(N,)`` bool, True for
         points that are inliers in both views.
     """
-    n = len(points)
+    T_c_1, points, inlier = adjust_views(
+        np.stack([np.eye(4), T_2_1]), points, uv.swapaxes(0, 1), np.tile(sigma, (2, 1)), camera
+    )
+    both = np.logical_and(inlier[0], inlier[1])
+    return *scaled(T_c_1[1], points, both, depth), both
+
+
+def adjust_views(
+    T_c_1: Matrix, points: Matrix, uv: Matrix, sigma: Matrix, camera: Camera
+) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
+    """Run bundle adjustment of K views. The unit of length of the result is arbitrary.
+
+    Args:
+        T_c_1: ``(K, 4, 4)`` initial transforms from camera 1 to each camera. The first one is the
+            identity, and stays fixed.
+        points: ``(N, 3)`` initial points in the frame of camera 1.
+        uv: ``(K, N, 2)`` position of each point in each view, pixels; NaN where it is not seen.
+        sigma: ``(K, N)`` standard deviation of these positions, pixels.
+
+    Returns:
+        ``(K, 4, 4)`` transforms; ``(N, 3)`` points; ``(K, N)`` bool, True for observations that
+        are inliers.
+    """
+    seen = np.isfinite(uv[..., 0])
+    point, view = np.nonzero(seen.T)
+    n_views, first = len(T_c_1), np.append(0, np.cumsum(seen.sum(axis=0)))
+    observed = uv[view, point]
     problem = BundleProblem(
-        T_cw=np.stack([T_2_1, np.eye(4)]),
-        n_free=1,
+        T_cw=np.roll(T_c_1, -1, axis=0),  # the fixed camera is the last
+        n_free=n_views - 1,
         points=points,
-        first=np.arange(0, 2 * n + 1, 2, dtype=np.int64),
-        camera=np.tile(np.array([1, 0], np.int64), n),
-        uvr=stack_uvr(uv.reshape(2 * n, 2), np.full(2 * n, np.nan)),
-        inverse_sigma2=np.repeat(sigma**-2.0, 2),
+        first=first,
+        camera=(view - 1) % n_views,
+        uvr=stack_uvr(observed, np.full(len(observed), np.nan)),
+        inverse_sigma2=sigma[view, point] ** -2.0,
         intrinsics=camera.intrinsics,
     )
     solution = adjust(problem, iterations=ITERATIONS)
-    inlier = np.logical_and(solution.inlier[0::2], solution.inlier[1::2])
-    T_2_1, points = solution.T_cw[0].copy(), solution.points
-    if inlier.any():
-        scale = depth / float(np.median(points[inlier, 2]))
-        T_2_1[:3, 3] *= scale
-        points = points * scale
-    return T_2_1, points, inlier
+    inlier = np.zeros(seen.shape, np.bool_)
+    inlier[view, point] = solution.inlier
+    return np.roll(solution.T_cw, 1, axis=0), solution.points, inlier
+
+
+def scaled(
+    T_2_1: Matrix, points: Matrix, inlier: NDArray[np.bool_], depth: float
+) -> tuple[Matrix, Matrix]:
+    """Scale a motion and ``(N, 3)`` points to a median depth of the inliers."""
+    if not inlier.any():
+        return T_2_1, points
+    scale, T_2_1 = depth / float(np.median(points[inlier, 2])), T_2_1.copy()
+    T_2_1[:3, 3] *= scale
+    return T_2_1, scale * points

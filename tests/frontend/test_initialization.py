@@ -7,10 +7,12 @@ import pytest
 
 from vslam.config import InitializationConfig
 from vslam.frontend.initialization import (
+    fit_models,
     motions_of_essential,
     motions_of_homography,
     reconstruct,
-    select_model,
+    refined_motion,
+    sampson_errors,
 )
 from vslam.types.camera import Camera
 from vslam.types.geometry import inverse, se3_exp, transform
@@ -53,11 +55,12 @@ def turn_deg(R_a, R_b):
 
 @pytest.mark.parametrize("outliers", [0.0, 0.4])
 @pytest.mark.parametrize("motion", [ASIDE, AHEAD])
-@pytest.mark.parametrize(("kind", "model"), [("wall", "homography"), ("volume", "fundamental")])
-def test_the_model_that_explains_the_scene_is_selected(kind, model, motion, outliers):
+@pytest.mark.parametrize(("kind", "model"), [("wall", 0), ("volume", 1)])
+def test_a_model_explains_the_scene(kind, model, motion, outliers):
+    """A homography explains a wall, and a fundamental matrix a volume."""
     xy_1, xy_2, right = views(scene(kind), motion, outliers=outliers)
-    found = select_model(xy_1, xy_2, np.ones(len(xy_1)), seed=1)
-    assert found.kind == model
+    found = fit_models(xy_1, xy_2, np.ones(len(xy_1)), seed=1)[model]
+    assert found.kind == ("homography", "fundamental")[model]
     assert np.count_nonzero(found.inlier & right) > 0.85 * np.count_nonzero(right)
     if outliers:
         assert np.count_nonzero(found.inlier & ~right) < 0.2 * np.count_nonzero(~right)
@@ -66,7 +69,6 @@ def test_the_model_that_explains_the_scene_is_selected(kind, model, motion, outl
 def test_a_camera_that_only_turns_makes_a_homography_and_no_map():
     turn = se3_exp(np.array([0.0, 0.0, 0.0, 0.02, 0.1, 0.01]))
     xy_1, xy_2, _ = views(scene("volume"), turn)
-    assert select_model(xy_1, xy_2, np.ones(len(xy_1)), seed=1).kind == "homography"
     assert reconstruct(xy_1, xy_2, np.ones(len(xy_1)), CAMERA, CONFIG, seed=1) is None
 
 
@@ -113,7 +115,6 @@ def test_motion_and_points_of_a_volume_with_wrong_matches(motion):
 def test_a_wall_leaves_two_motions_and_none_is_taken():
     far_aside = se3_exp(np.array([-2.5, 0.1, 0.5, 0.01, -0.2, 0.02]))
     xy_1, xy_2, _ = views(scene("wall", 400), far_aside, noise=0.2, outliers=0.2)
-    assert select_model(xy_1, xy_2, np.ones(400), seed=1).kind == "homography"
     assert reconstruct(xy_1, xy_2, np.ones(400), CAMERA, CONFIG, seed=1) is None
 
 
@@ -122,7 +123,6 @@ def test_motion_along_a_floor():
     aside = se3_exp(np.array([-1.0, 0.0, 0.1, 0.0, 0.1, 0.0]))
     points = scene("floor", 400)
     xy_1, xy_2, right = views(points, aside, noise=0.2, outliers=0.2)
-    assert select_model(xy_1, xy_2, np.ones(400), seed=1).kind == "homography"
     found = reconstruct(xy_1, xy_2, np.ones(400), CAMERA, CONFIG, seed=1)
     assert found is not None
     assert turn_deg(found.T_2_1[:3, :3], aside[:3, :3]) < 0.2
@@ -155,3 +155,45 @@ def test_the_same_seed_gives_the_same_bytes():
     assert one is not None
     assert one.points.tobytes() == two.points.tobytes()
     assert inverse(one.T_2_1).tobytes() == inverse(two.T_2_1).tobytes()
+
+
+# -- refinement -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("motion", [ASIDE, AHEAD])
+def test_a_motion_is_refined_on_the_sampson_error(motion):
+    xy_1, xy_2, _ = views(scene("volume", 400), motion, noise=0.05)
+    xy_2[:20] += 8.0
+    start = se3_exp(np.array([0.0, 0.0, 0.0, 0.004, -0.005, 0.004])) @ motion
+    start[:3, 3] += 0.1 * np.linalg.norm(start[:3, 3])
+    found = refined_motion(start, xy_1, xy_2, np.ones(400), CAMERA)
+    assert turn_deg(found[:3, :3], motion[:3, :3]) < 0.04
+    assert angle_deg(found[:3, 3], motion[:3, 3]) < 0.1
+    assert np.linalg.norm(found[:3, 3]) == pytest.approx(1.0)
+
+
+def test_sampson_errors_are_distances_in_pixels():
+    """A point that is moved across its epipolar line errs by this distance, shared between views
+    of the same scale."""
+    xy_1, xy_2, _ = views(scene("volume"), ASIDE, noise=0.0)
+    np.testing.assert_allclose(sampson_errors(ASIDE, xy_1, xy_2, CAMERA), 0.0, atol=1e-9)
+    errors = sampson_errors(ASIDE, xy_1, xy_2 + np.array([0.0, 1.0]), CAMERA)
+    np.testing.assert_allclose(np.abs(errors), np.sqrt(0.5), rtol=0.05)
+
+
+def test_aligned_matches_tell_the_two_motions_of_a_wall_apart():
+    """Positions err by half a pixel, and by 0.02 pixels after alignment."""
+    aside = se3_exp(np.array([-1.5, 0.1, 0.5, 0.01, -0.15, 0.02]))
+    points = scene("wall", 400) + np.random.default_rng(5).normal(0, 0.02, (400, 3))
+    exact_1, exact_2, _ = views(points, aside, noise=0.0)
+    rng = np.random.default_rng(1)
+    xy_2 = exact_2 + rng.normal(0, 0.5, exact_2.shape)
+    aligned = exact_2 + rng.normal(0, 0.02, exact_2.shape) - xy_2
+    ones = np.ones(400)
+    assert reconstruct(exact_1, xy_2, ones, CAMERA, CONFIG, seed=1) is None
+    found = reconstruct(
+        exact_1, xy_2, ones, CAMERA, CONFIG, seed=1, align=lambda T, match, points: aligned[match]
+    )
+    assert found is not None
+    assert turn_deg(found.T_2_1[:3, :3], aside[:3, :3]) < 0.1
+    np.testing.assert_allclose(found.shift, aligned[found.match])

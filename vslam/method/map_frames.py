@@ -12,9 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.frontend.patches import certainty_of
 from vslam.frontend.rig import with_offset
 from vslam.method.hypotheses import joined_submaps
 from vslam.method.starter import TwoViewStart
+from vslam.types.context import Context
 from vslam.types.features import TrackingState
 from vslam.types.frame_poses import FramePoses
 from vslam.types.geometry import compose, inverse, inverses, orthonormalised, transform
@@ -63,7 +65,9 @@ def add_frame(
     return keyframe
 
 
-def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, int]:
+def add_two_views(
+    map_: Map, start: TwoViewStart, reference: int, context: Context
+) -> tuple[int, int]:
     """Add the first two keyframes of a monocular map or sub-map, and their common landmarks.
 
     Args:
@@ -73,9 +77,19 @@ def add_two_views(map_: Map, start: TwoViewStart, reference: int) -> tuple[int, 
         The ids of the two keyframes.
     """
     one, two, T_1_w = start.first, start.second, start.first.T_cw
-    first = map_.add_keyframe(one.features, T_1_w, one.timestamp, one.index, gravity=one.gravity)
-    T_2_w = compose(start.T_2_1, T_1_w)
-    second = map_.add_keyframe(two.features, T_2_w, two.timestamp, two.index, gravity=two.gravity)
+    keyframes = []
+    for track, T_cw, seen in (
+        (one, T_1_w, start.features[0]),
+        (two, compose(start.T_2_1, T_1_w), start.features[1]),
+    ):
+        # Only which features match matters here; the landmarks have no ids yet.
+        matched = track.matching(seen, np.zeros(len(seen), np.int32), start.points)
+        certainty = certainty_of(matched if track is two else track, context)
+        keyframe = map_.add_keyframe(
+            matched.refined_features(), T_cw, track.timestamp, track.index, certainty, track.gravity
+        )
+        keyframes.append(keyframe)
+    first, second = keyframes
     rows = [
         map_.rows(keyframe).start + features
         for keyframe, features in zip((first, second), start.features, strict=True)

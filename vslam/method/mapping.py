@@ -133,14 +133,14 @@ class Mapper:
         published.complete()
         with published.change() as map_:
             second = self._make_room(map_, start.second)
-            keyframes = add_two_views(map_, start, published.reference)
+            keyframes = add_two_views(map_, start, published.reference, self._context)
             tracks = start.first, second
             for keyframe, track, image in zip(keyframes, tracks, start.images, strict=True):
                 self._closing.process(map_, keyframe, track.features, image)
             published.frames.replace(start.first.index, keyframes[0])
-            published.refer_to_new(keyframes[1], second)
             first = observe_keyframe(start.first, map_, keyframes[0])
             second = observe_keyframe(second, map_, keyframes[1])
+            published.refer_to_new(keyframes[1], second)
         frames, twist = published.frames, start.twist
         return (
             replace(first, T_cw=frames.pose(first.index), twist=twist),

@@ -14,13 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.two_views import adjust_two_views
+from vslam.frontend.alignment import find_patches
 from vslam.frontend.images import GivenFeatures
-from vslam.frontend.initialization import KnownTurn, match_views, reconstruct
+from vslam.frontend.initialization import Align, KnownTurn, match_views, reconstruct
+from vslam.frontend.patches import patches_around
 from vslam.frontend.prediction import Prediction
 from vslam.frontend.tracker import Tracker
 from vslam.types.camera import Image
 from vslam.types.context import Context
-from vslam.types.features import Extracted
+from vslam.types.features import Extracted, LandmarkPatches
 from vslam.types.geometry import (
     Matrix,
     inverse,
@@ -37,8 +39,8 @@ from vslam.types.track import Track
 # towns, it was at most 0.24 for pairs whose translations are wrong by less than 8 degrees. [own]
 _MIN_COMMON, _MAX_SPREAD = 30, 0.3
 # At most this many frames wait for the map. Each takes about 0.1 MB, and 10 ms when the map begins.
-# [own]
-_MAX_WAITING = 300
+# The newest also keep their images, about 1 MB each, to which matches are aligned. [own]
+_MAX_WAITING, _WITH_IMAGES = 300, 60
 
 TurnBetween = Callable[[float, float], KnownTurn | None]
 
@@ -48,7 +50,8 @@ class TwoViewStart:
     """The start of a monocular map or sub-map from two frames.
 
     Attributes:
-        first, second: the two frames. The map begins at the pose of the first frame.
+        first, second: the two frames. The map begins at the pose of the first frame. The matches of
+            the second are aligned to the first (``Track.shift``).
         images: their ``(H, W)`` uint8 images for loop detectors. None if they are not available.
         T_2_1: ``(4, 4)``, maps points from the camera of the first frame to the camera of the
             second frame.
@@ -99,7 +102,7 @@ class TwoViewStart:
     def agrees(self, before: TwoViewStart) -> bool:
         """Return whether an earlier start gives the same scene, up to scale. Its first or second
         frame must be the first frame of this start."""
-        which = 0 if before.first is self.first else 1
+        which = 0 if before.first.index == self.first.index else 1
         points = before.points if which == 0 else transform(before.T_2_1, before.points)
         _, mine, theirs = np.intersect1d(
             self.features[0], before.features[which], return_indices=True
@@ -151,8 +154,11 @@ class Starter:
         if len(track.features) < self._context.config.initialization.min_matches:
             self._waiting = ()
             return
-        features_only = Extracted(track.features)
-        self._waiting = (*self._waiting, replace(track, extracted=features_only))[-_MAX_WAITING:]
+        waiting = [*self._waiting, track][-_MAX_WAITING:]
+        if len(waiting) > _WITH_IMAGES:
+            old = waiting[-_WITH_IMAGES - 1]
+            waiting[-_WITH_IMAGES - 1] = replace(old, extracted=Extracted(old.features))
+        self._waiting = tuple(waiting)
 
     def offer(self, track: Track, image: Image | None) -> TwoViewStart | None:
         """Try to begin a map with a frame that was not tracked and the earlier frame that was kept.
@@ -186,7 +192,7 @@ class Starter:
             self._start = start
             return None
         if start is None and before is not None:  # the camera may have moved far since the first
-            middle = before.second, before.images[1]
+            middle = _unaligned(before.second), before.images[1]
             features = match_views(before.second.features, track.features, self._context)
             start = self._pair(middle, second, features)
             if start is not None and not start.agrees(before):
@@ -213,24 +219,69 @@ class Starter:
         turn = None
         if self._turn_between is not None:
             turn = self._turn_between(first[0].timestamp, second[0].timestamp)
-        found = reconstruct(xy_1, xy_2, sigma, camera, config, seed=second[0].index, turn=turn)
+        align = _aligned_to(first[0], second[0], features, self._context)
+        found = reconstruct(
+            xy_1, xy_2, sigma, camera, config, seed=second[0].index, turn=turn, align=align
+        )
         if found is None:
             return None
-        match = found.match
+        match, shift = found.match, found.shift
+        aligned = np.isfinite(shift[:, 0])
+        certainty = np.where(aligned, self._context.aligned_certainty, 1)
         T_2_1, points, kept = adjust_two_views(
             found.T_2_1,
             found.points,
-            np.stack([xy_1[match], xy_2[match]], axis=1),
-            sigma[match],
+            np.stack([xy_1[match], xy_2[match] + np.where(aligned[:, None], shift, 0.0)], axis=1),
+            sigma[match] / np.sqrt(certainty),
             camera,
             config.median_depth,
         )
         if np.count_nonzero(kept) < config.min_landmarks:
             return None
-        match = match[kept]
-        features = features[0][match], features[1][match]
+        match, shift = match[kept], shift[kept]
+        features, track = (features[0][match], features[1][match]), second[0]
+        if aligned.any():
+            all_shifts = np.full(of_2.xy.shape, np.nan, np.float32)
+            all_shifts[features[1]] = shift
+            track = replace(track, shift=all_shifts)
         images = first[1], second[1]
-        return TwoViewStart(first[0], second[0], images, T_2_1, features, points[kept])
+        return TwoViewStart(first[0], track, images, T_2_1, features, points[kept])
+
+
+def _unaligned(track: Track) -> Track:
+    return track if track.shift is None else replace(track, shift=None)
+
+
+def _aligned_to(
+    first: Track, second: Track, features: tuple[NDArray, NDArray], context: Context
+) -> Align | None:
+    """Return the function that aligns the matches of two frames; None if their images are not
+    available."""
+    pyramid_1, pyramid_2 = first.extracted.pyramid, second.extracted.pyramid
+    if pyramid_1 is None or pyramid_2 is None:
+        return None
+    scales, of_1, of_2 = context.scales, first.features, second.features
+    n, xy_1, octave_1 = len(features[0]), of_1.xy[features[0]], of_1.octave[features[0]]
+    patches = LandmarkPatches(
+        np.arange(n, dtype=np.int32),
+        np.arange(n),
+        np.zeros(n, np.int64),
+        scales[octave_1],
+        of_1.angle[features[0]],
+        patches_around(pyramid_1, xy_1, octave_1),
+        np.zeros((n, 2), np.float32),
+        np.eye(4)[None],
+    )
+
+    def align(T_2_1: Matrix, match: NDArray[np.int64], points: Matrix) -> Matrix:
+        xy, octave = of_2.xy[features[1][match]], of_2.octave[features[1][match]]
+        intrinsics, config = context.camera.intrinsics, context.config.alignment
+        shift = find_patches(
+            pyramid_2, xy, octave, T_2_1, points, patches, match, scales, intrinsics, config
+        )
+        return np.asarray(shift * scales[octave][:, None], np.float64)
+
+    return align
 
 
 def track_waiting(

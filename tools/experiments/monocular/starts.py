@@ -1,0 +1,183 @@
+"""Start monocular maps on rendered drives, and compare the rotation errors with those of stereo.
+
+    python tools/experiments/monocular/starts.py --seeds 61 62 63 --out starts.csv
+
+``mono_deg`` and ``stereo_deg`` are the RMSE of the rotation from frame to frame, in degrees, over
+all frames whose pose the monocular run has found. ``first_s`` is the time of the first keyframe
+pair, and ``untracked`` the number of frames without a pose at the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from vslam.datasets.frames import Source
+from vslam.datasets.kitti import open_kitti
+from vslam.evaluation.trajectories import ate_rmse
+from vslam.slam import Slam
+from vslam.types.geometry import inverses
+from vslam.types.trajectory import Trajectory
+from vslam_lab.towns import Route, Variation, cache_folder, render_sequence, route_named
+
+Float = NDArray[np.float64]
+
+FRAMES = 80
+PAN_S = 1.5  # before the camera moves
+
+
+def part(name: str, seed: int, first_s: float) -> Route:
+    """Return FRAMES frames of a built-in route from a time on."""
+    route = route_named(name, Variation(seed=seed))
+    first = round(first_s * route.rate)
+    T_wc = np.ascontiguousarray(route.T_wc[first : first + FRAMES])
+    return replace(route, name=f"{name}-{first}-{FRAMES}", T_wc=T_wc)
+
+
+def hand_held(seed: int) -> Route:
+    return part("room" if seed % 2 else "walk", seed, 0.5 * (seed % 7))
+
+
+def flying(seed: int) -> Route:
+    return part("hall" if seed % 2 else "drone", seed, 1.5)
+
+
+def turning(seed: int, seconds: float) -> Float:
+    """Return the ``(N, 3, 3)`` rotations of a camera that looks around."""
+    rng = np.random.default_rng([seed, 7])
+    t = np.arange(round(20.0 * seconds)) / 20.0
+    rate = rng.uniform(0.3, 0.9) * rng.choice([-1.0, 1.0])  # rad/s
+    nod = rng.uniform(0.05, 0.15) * np.sin(2.0 * np.pi * t / rng.uniform(1.0, 3.0))
+    return Rotation.from_euler("YX", np.column_stack([rate * t, nod])).as_matrix()
+
+
+def only_panning(seed: int) -> Route:
+    """Turn the camera about its optical centre."""
+    route = part("room" if seed % 2 else "walk", seed, 0.0)
+    T_wc = np.tile(route.T_wc[0], (FRAMES, 1, 1))
+    T_wc[:, :3, :3] = T_wc[:, :3, :3] @ turning(seed, FRAMES / route.rate)
+    return replace(route, name=f"pan-{route.name}", T_wc=T_wc)
+
+
+def panning(seed: int) -> Route:
+    """Turn the camera about its optical centre, and then move it."""
+    route = part("room" if seed % 2 else "walk", seed, 0.0)
+    turns = turning(seed, PAN_S)
+    n = len(turns)
+    T_wc = route.T_wc.copy()
+    T_wc[n:] = route.T_wc[: FRAMES - n]
+    T_wc[:n] = route.T_wc[0]
+    back = turns[-1].T @ turns  # ends at the first pose of the route
+    T_wc[:n, :3, :3] = T_wc[:n, :3, :3] @ back
+    return replace(route, name=f"pan-then-{route.name}", T_wc=T_wc)
+
+
+def planar(seed: int) -> Route:
+    """Fly above a street and look straight down, or along the wall of a hall."""
+    rng = np.random.default_rng([seed, 9])
+    route = part("walk", seed, 0.0)
+    t = np.arange(FRAMES) / route.rate
+    T_wc = route.T_wc.copy()
+    level = T_wc[:, :3, 3]
+    along = np.linspace(0.0, 1.0, FRAMES)[:, None] * (level[-1] - level[0])
+    T_wc[:, :3, 3] = level[0] + along
+    heading = np.arctan2(along[-1, 0], along[-1, 2])
+    sway = 0.05 * np.sin(2.0 * np.pi * t / rng.uniform(1.0, 2.0))
+    angles = np.column_stack([np.full(FRAMES, heading), np.full(FRAMES, -1.35) + sway, 0.5 * sway])
+    T_wc[:, :3, :3] = Rotation.from_euler("YXZ", angles).as_matrix()
+    return replace(route, name=f"planar-{route.name}", T_wc=T_wc)
+
+
+def forwards(seed: int) -> Route:
+    route = route_named("04", Variation(seed=seed))
+    camera = route.camera
+    centre = {"cx": (camera.cx - 0.5) / 2, "cy": (camera.cy - 0.5) / 2}
+    size = {"width": camera.width // 2, "height": camera.height // 2}
+    half = replace(camera, fx=camera.fx / 2, fy=camera.fy / 2, **centre, **size)
+    first = 15 * (seed % 5)
+    T_wc = np.ascontiguousarray(route.T_wc[first : first + FRAMES // 2])
+    return replace(route, name=f"04-{first}-{FRAMES // 2}", camera=half, T_wc=T_wc)
+
+
+FAMILIES: dict[str, Callable[[int], Route]] = {
+    "hand-held": hand_held, "flying": flying, "panning": panning, "planar": planar,
+    "forwards": forwards, "only panning": only_panning,
+}  # fmt: skip
+
+
+def run(source: Source, *, mono: bool) -> Slam:
+    camera = source.camera.left_camera() if mono else source.camera
+    slam = Slam(camera, detector="none", threads=1)
+    for frame in source.frames():
+        left, right = frame.read(map)
+        slam.step(left, None if mono else right, frame.timestamp)
+    slam.finish()
+    return slam
+
+
+def rotation_errors(T_wc: Float, truth: Float) -> Float:
+    """Return the ``(N - 1,)`` errors of the rotations from frame to frame, in degrees."""
+    found, expected = (inverses(T[:-1]) @ T[1:] for T in (T_wc, truth))
+    error = inverses(expected) @ found
+    return np.degrees(Rotation.from_matrix(error[:, :3, :3]).magnitude())
+
+
+def rms(values: Float) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else np.nan
+
+
+def row(family: str, seed: int, cache: Path) -> dict[str, object]:
+    route = FAMILIES[family](seed)
+    root = render_sequence(route, Variation(seed=seed), cache)
+    source = open_kitti(root, route.name)
+    mono, stereo = run(source, mono=True), run(source, mono=False)
+    known, map_ = mono.tracked(), mono.map
+    both = known[1:] & known[:-1]
+    errors = [
+        rotation_errors(one.trajectory().T_wc, route.ground_truth)[both] for one in (mono, stereo)
+    ]
+    begun = map_.n_keyframes > 0
+    ate = np.nan
+    if begun and known.sum() > 3:
+        found = mono.trajectory().select(np.flatnonzero(known))
+        truth = Trajectory(found.timestamps, route.ground_truth[known])
+        ate = ate_rmse(found, truth, "sim3")
+    return {
+        "family": family, "route": route.name, "seed": seed, "frames": len(route.T_wc),
+        "first_s": float(route.timestamps[map_.frames[1]]) if begun else np.nan,
+        "untracked": int((~known).sum()), "parts": len({0, *map_.restarts}) if begun else 0,
+        "ate_m": ate, "mono_deg": rms(errors[0]), "stereo_deg": rms(errors[1]),
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--families", nargs="+", choices=FAMILIES, default=list(FAMILIES))
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(range(61, 71)))
+    parser.add_argument("--towns", type=Path, default=cache_folder())
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    rows = []
+    for family in options.families:
+        for seed in options.seeds:
+            rows.append(row(family, seed, options.towns))
+            print(
+                {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in rows[-1].items()},
+                flush=True,
+            )
+    with options.out.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
+        writer.writeheader()
+        for one in rows:
+            writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in one.items()})
+
+
+if __name__ == "__main__":
+    main()

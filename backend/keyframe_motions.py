@@ -15,9 +15,9 @@ from vslam.backend.inertial_factor import Motions
 from vslam.backend.inertial_filter import inflated
 from vslam.backend.preintegration import Preintegration, preintegrate
 from vslam.types.imu import InertialWindow
-from vslam.types.map import Map
+from vslam.types.map import CARRIED, Map
 
-LONGEST_S = 1.5  # s between two keyframes that a motion connects
+LONGEST_S = 3.5  # s between two keyframes that a motion connects
 # Standard deviation of the displacement, in m, besides the noise of the samples. Within one
 # interval between two samples, this noise alone would tie the displacement to the velocity. [own]
 SIGMA_M = 1e-5
@@ -26,11 +26,12 @@ SIGMA_M = 1e-5
 def record_motion(map_: Map, keyframe: int, window: InertialWindow) -> None:
     """Integrate the samples since the keyframe before, and keep the motion with a keyframe.
 
-    Nothing is kept if samples are missing, or if the keyframe begins a drive or a sub-map.
+    Nothing is kept if samples are missing, or if the keyframe begins a drive, or a sub-map to
+    which the IMU did not carry the camera.
     """
     table, samples, before = map_.keyframes, window.samples, keyframe - 1
     begins = before < 0 or map_.sessions[before] != map_.sessions[keyframe]
-    if begins or table.restart[keyframe] or not len(samples):
+    if begins or table.restart[keyframe] not in (0, CARRIED) or not len(samples):
         return
     start, end = map_.timestamps[[before, keyframe]].tolist()
     if start < samples[0, 0] or end - start > LONGEST_S:

@@ -36,12 +36,13 @@ from vslam.backend.local_mapping import assemble, remove_observations, window_la
 from vslam.types.context import Context
 from vslam.types.geometry import Matrix, inverses
 from vslam.types.imu import GRAVITY, InertialWindow
-from vslam.types.map import Map
+from vslam.types.map import CARRIED, Map
 from vslam.types.map_kernels import refresh_landmarks
 
 # The number of newest keyframes that are adjusted together, and after how many new keyframes. They
 # are 10 to 40 s of a drive. [own]
 WIDE_KEYFRAMES, WIDE_EVERY = 100, 20
+_SOON = (4, 8)  # keyframes after the first one of a sub-map
 _ITERATIONS, _TOLERANCE = 15, 1e-6
 # What is known of gravity before the adjustment: its length, and hardly its direction (m/s^2, rad).
 _LENGTH, _TILT = 1e-3, 0.1
@@ -113,8 +114,7 @@ def adjust_widely(
         inertial: what is known from the IMU at a frame.
         R_world_camera: ``(3, 3)`` rotation of the camera at this frame, in the world frame.
     """
-    restarts = map_.restarts
-    first = restarts[-1] if restarts else 0
+    first = max(_breaks(map_), default=0)
     chain = _newest_chain(map_, first, keyframe, inertial, R_world_camera)
     if chain is None:
         return
@@ -132,6 +132,18 @@ def adjust_widely(
     a.xyz[landmarks] = found.points
     remove_observations(a, rows[~found.inlier])
     refresh_landmarks(a, landmarks, map_.scales)
+
+
+def is_wide(map_: Map, keyframe: int) -> bool:
+    """Return whether the newest keyframes are adjusted together after a keyframe: regularly, and
+    soon after a sub-map has begun, whose scale is that of a distance that the IMU measured."""
+    young = map_.restarts and keyframe - map_.restarts[-1] in _SOON
+    return bool(young) or keyframe % WIDE_EVERY == 0
+
+
+def _breaks(map_: Map) -> list[int]:
+    """Return the first keyframes of the sub-maps whose distance from the map was not measured."""
+    return [one for one in map_.restarts if map_.keyframes.restart[one] != CARRIED]
 
 
 def _newest_chain(

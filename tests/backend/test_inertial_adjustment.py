@@ -232,7 +232,8 @@ def test_samples_that_contradict_the_images_are_not_used():
 
 
 def test_a_chain_begins_after_the_last_gap():
-    rows, times = samples(), 0.5 + 0.3 * np.arange(8)
+    rows = FLIGHT.samples(np.arange(-0.1, 7.0, 0.005), BIAS)
+    times = 0.5 + 0.3 * np.arange(8)
 
     def chained(rows: np.ndarray, times: np.ndarray) -> list[int] | None:
         found = window(rows)
@@ -242,7 +243,7 @@ def test_a_chain_begins_after_the_last_gap():
     assert chained(rows, times) == [*range(8)]
     gap = (rows[:, 0] > 1.2) & (rows[:, 0] < 1.35)
     assert chained(rows[~gap], times) == [*range(3, 8)]
-    late = times + np.where(np.arange(8) > 5, 1.3, 0.0)
+    late = times + np.where(np.arange(8) > 5, 3.4, 0.0)
     assert chained(rows, late) == [6, 7]
     assert chained(rows[rows[:, 0] > 1.0], times) == [*range(2, 8)]
     assert chained(rows[:0], times) is None

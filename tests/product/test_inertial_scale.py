@@ -140,6 +140,31 @@ def test_a_drive_that_is_continued_from_a_file_keeps_its_scale_to_the_byte(drive
         assert result.T_wc.tobytes() == drive.results[k].T_wc.tobytes()
 
 
+def test_an_unseen_scene_after_the_dark_is_metric_and_belongs_to_the_same_map(drive):
+    slam = Slam.load(drive.file, resume=True, threads=1, imu=CALIBRATION)
+    other, rows, dark, results = corridor_mipmaps(seed=8), drive.rows, range(112, 132), []
+    for k in range(drive.saved + 1, len(TIMES)):
+        image = drive.images[k] if k < dark.start else np.zeros((160, 480), np.uint8)
+        if k >= dark.stop:
+            image = render(other, CAMERA, FLIGHT.pose(TIMES[k]))
+        new = rows[(rows[:, 0] > TIMES[k - 1]) & (rows[:, 0] <= TIMES[k])]
+        results.append(slam.step(image, None, TIMES[k], imu=new))
+    slam.finish()
+    assert TrackingState.LOST not in {one.state for one in results}
+    assert results[-1].state == TrackingState.OK
+    assert len(slam.map.restarts) == 1
+    assert slam.gaps() == []
+    assert slam.metric_since == drive.slam.metric_since
+    T_wc = slam.trajectory().T_wc
+    apart = (
+        inverse(inverse(TRUTH[dark.start - 1]) @ TRUTH[-1])
+        @ inverse(T_wc[dark.start - 1])
+        @ T_wc[-1]
+    )
+    assert np.linalg.norm(apart[:3, 3]) < 0.1
+    assert scale_of(T_wc[dark.stop + 6 :], TRUTH[dark.stop + 6 :]) == pytest.approx(1.0, abs=0.03)
+
+
 def test_an_even_motion_tells_no_scale_and_a_sentence_says_so():
     steady = Walk(1, speed=0.0, turning=0.0)
     mipmaps = corridor_mipmaps()

@@ -100,7 +100,7 @@ def add_two_views(
         link_many(map_.arrays, rows_of_view, ids)
     refresh_landmarks(map_.arrays, ids, map_.scales)
     if first > 0:
-        map_.begin_submap(first, reference, predicted=start.predicted)
+        map_.begin_submap(first, reference, predicted=start.predicted, carried=start.is_carried)
     map_.parents[second] = first
     return first, second
 

@@ -13,7 +13,7 @@ import numpy as np
 from vslam.backend.disparity_offset import map_and_calibrate
 from vslam.backend.keyframe_motions import record_motion
 from vslam.backend.local_mapping import MIN_SHARED, refresh_keyframe
-from vslam.backend.metric_mapping import WIDE_EVERY, MapScale, adjust_widely, scale_of_map
+from vslam.backend.metric_mapping import MapScale, adjust_widely, is_wide, scale_of_map
 from vslam.backend.triangulation import map_stereo_points
 from vslam.frontend.patches import certainty_of
 from vslam.method.closing import LoopClosing
@@ -134,6 +134,9 @@ class Mapper:
         with published.change() as map_:
             second = self._make_room(map_, start.second)
             keyframes = add_two_views(map_, start, published.reference, self._context)
+            if start.second.inertial is not None:
+                for keyframe in keyframes:
+                    record_motion(map_, keyframe, start.second.inertial)
             tracks = start.first, second
             for keyframe, track, image in zip(keyframes, tracks, start.images, strict=True):
                 self._closing.process(map_, keyframe, track.features, image)
@@ -227,8 +230,7 @@ class Mapper:
 
     def _map_keyframe(self, keyframe: int, inertial: InertialWindow | None, map_: Map) -> None:
         map_and_calibrate(map_, keyframe, self._context, inertial)
-        wide = self._context.camera.monocular and keyframe % WIDE_EVERY == 0
-        if wide and inertial is not None:
+        if self._context.camera.monocular and inertial is not None and is_wide(map_, keyframe):
             R_wc = map_.keyframe_pose(keyframe)[:3, :3].T
             adjust_widely(map_, keyframe, self._context, inertial, R_wc)
         self._closing.apply_adjustment_if_due(map_, keyframe)

@@ -149,7 +149,10 @@ class Building:
         if start is None:
             return track
         (moved,) = self._published.complete(track)
-        start = start.at_speed(moved.twist, _MAX_RESCALING)
+        carried = start.is_carried
+        start = start.as_carried() if carried else start.at_speed(moved.twist, _MAX_RESCALING)
+        if start is None:
+            return track
         first, second = self._mapper.begin(start)
         for found in track_waiting(start, first, second, self._published.view, self._tracker):
             self._published.frames.find(found.index, found.T_cw, beside=first.index)

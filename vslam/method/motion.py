@@ -338,10 +338,10 @@ class Motion:
         turned: Matrix = T.T @ T_now_last @ T
         return turned
 
-    def keyframe(self) -> None:
+    def keyframe(self, track: Track) -> None:
         """Note that the last frame became a keyframe."""
-        inertia = self.state.inertia
-        if self._context.camera.monocular and self.state.lost_frames:
+        inertia, carried = self.state.inertia, track.state == TrackingState.INERTIAL
+        if self._context.camera.monocular and self.state.lost_frames and not carried:
             inertia = without_scale(inertia)
         self.state = MotionState(at_keyframe(self.state.odometry), 0, inertia)
 

@@ -331,7 +331,7 @@ class Session:
     def _end(self, track: Track, clock: StageClock, next_extraction: int = -1) -> TrackResult:
         """End the step of a frame, which may have become a keyframe."""
         if track.is_keyframe:
-            self._motion.keyframe()
+            self._motion.keyframe(track)
         if track.is_keyframe or not track.is_lost:
             self.last = track
         self.rig.observe(track)

@@ -22,7 +22,7 @@ from vslam.frontend.prediction import Prediction
 from vslam.frontend.tracker import Tracker
 from vslam.types.camera import Image
 from vslam.types.context import Context
-from vslam.types.features import Extracted, LandmarkPatches
+from vslam.types.features import Extracted, LandmarkPatches, TrackingState
 from vslam.types.geometry import (
     Matrix,
     inverse,
@@ -41,6 +41,10 @@ _MIN_COMMON, _MAX_SPREAD = 30, 0.3
 # At most this many frames wait for the map. Each takes about 0.1 MB, and 10 ms when the map begins.
 # The newest also keep their images, about 1 MB each, to which matches are aligned. [own]
 _MAX_WAITING, _WITH_IMAGES = 300, 60
+
+# Largest angle between the directions in which a camera has moved according to an IMU that carried
+# it, and according to two views, in rad. [own]
+_MAX_ANGLE = np.radians(10.0)
 
 TurnBetween = Callable[[float, float], KnownTurn | None]
 
@@ -95,6 +99,23 @@ class TwoViewStart:
         factor = float(moved / np.linalg.norm(self.T_2_1[:3, 3]))
         if not 1.0 / max_rescaling < factor < max_rescaling:
             return self
+        return self._scaled(factor)
+
+    @property
+    def is_carried(self) -> bool:
+        """Whether an IMU measured the poses of both frames."""
+        return self.first.state == self.second.state == TrackingState.INERTIAL
+
+    def as_carried(self) -> TwoViewStart | None:
+        """Scale the start to the distance between the two frames that the IMU measured. None if the
+        IMU measured another direction."""
+        measured = (self.second.T_cw @ inverse(self.first.T_cw))[:3, 3]
+        metres, units = np.linalg.norm(measured), np.linalg.norm(self.T_2_1[:3, 3])
+        if not measured @ self.T_2_1[:3, 3] > np.cos(_MAX_ANGLE) * metres * units:
+            return None
+        return self._scaled(float(metres / units))
+
+    def _scaled(self, factor: float) -> TwoViewStart:
         T_2_1 = self.T_2_1.copy()
         T_2_1[:3, 3] *= factor
         return replace(self, T_2_1=T_2_1, points=factor * self.points, predicted=True)

@@ -153,7 +153,7 @@ def drive_of(
     kept = (samples[:, 0] >= shift - 1e-9) & (samples[:, 0] <= shift + part.timestamps[-1] + 1e-9)
     samples = samples[kept]
     samples[:, 0] -= shift
-    depth = sensor == "rgbd"
+    depth = sensor != "stereo"  # so that both other sensors share the images
     cache = cache / "depth" if depth else cache
     root = render_sequence(part, Variation(seed=seed), cache, depth=depth)
     source = open_kitti(root, part.name, every=every)

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import csv
 import email
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
 import tomllib
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
+import numpy as np
 import pytest
+import yaml
+from conftest import corridor_depth
+from scipy.spatial.transform import Rotation
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -213,3 +221,100 @@ def test_the_image_is_not_root_and_copies_what_exists():
 def test_files_name_targets_of_make(file, at_least):
     named = re.findall(r"make ((?:[a-z-]+ ?)+)", (ROOT / file).read_text())
     assert at_least <= {target for words in named for target in words.split()} <= make_targets()
+
+
+# -- tools/packaging ------------------------------------------------------------------------------
+
+PACKAGING = ROOT / "tools" / "packaging"
+IN_CONDA = {"opencv-python-headless": "py-opencv", "matplotlib": "matplotlib-base"}
+
+
+def test_the_conda_recipe_has_the_requirements_of_the_project():
+    recipe = yaml.safe_load((PACKAGING / "conda" / "recipe.yaml").read_text())
+    wanted = [re.fullmatch(r"([\w-]+)(.*)", one).groups() for one in PROJECT["dependencies"]]
+    run = [f"{IN_CONDA.get(name, name)} {least}" for name, least in wanted]
+    assert recipe["requirements"]["run"] == ["python >=${{ python_min }}", *run]
+    assert recipe["context"]["version"] == PROJECT["version"]
+    assert f">={recipe['context']['python_min']}" == PROJECT["requires-python"]
+    (entry,) = PROJECT["scripts"].items()
+    assert recipe["build"]["python"]["entry_points"] == [" = ".join(entry)]
+
+
+LAB_CALIBRATION = """%YAML 1.2
+---
+cameras:
+  - {{cam_name: rgb_0,
+     cam_type: gray,
+     {depth}cam_model: pinhole,
+     focal_length: [240.0, '240.0'],
+     principal_point: [239.5, 79.5],
+     image_dimension: [480, 160],
+     fps: 10,
+     T_BS: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1] # Sensor extrinsics.
+    }}
+  - {{cam_name: rgb_1,
+     cam_type: gray,
+     cam_model: pinhole,
+     focal_length: [240.0, 240.0],
+     principal_point: [239.5, 79.5],
+     image_dimension: [480, 160],
+     fps: 10,
+     T_BS: [1, 0, 0, {baseline}, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    }}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["stereo", "rgbd"])
+def test_a_sequence_of_vslam_lab(corridor, tmp_path, monkeypatch, mode):
+    sides = {"rgb_0": corridor.left, "rgb_1": corridor.right}
+    scale = 0.2 if mode == "rgbd" else 1.0  # in a small corridor, depth images are accurate
+    if mode == "rgbd":
+        metres = [corridor_depth(corridor.camera, T) for T in corridor.T_wc]
+        del sides["rgb_1"]
+        sides["depth_0"] = [
+            np.uint16(5000 * scale * np.where(one < 65.0, one, 0)) for one in metres
+        ]
+    rows = [",".join(f"ts_{name} (ns),path_{name}" for name in sides)]
+    for k, time in enumerate(corridor.timestamps):
+        rows.append(",".join(f"{round(1e9 * time)},{name}/{k:06}.png" for name in sides))
+        for name, images in sides.items():
+            (tmp_path / name).mkdir(exist_ok=True)
+            cv2.imwrite(str(tmp_path / name / f"{k:06}.png"), images[k])
+    (tmp_path / "rgb_exp.csv").write_text("\n".join(rows) + "\n")
+    depth = "depth_name: depth_0, depth_factor: 5000.0, " if mode == "rgbd" else ""
+    text = LAB_CALIBRATION.format(baseline=corridor.camera.baseline, depth=depth)
+    (tmp_path / "calibration.yaml").write_text(text)
+    options = {"sequence_path": tmp_path, "calibration_yaml": tmp_path / "calibration.yaml",
+               "rgb_csv": tmp_path / "rgb_exp.csv", "exp_folder": tmp_path, "exp_it": 3,
+               "settings_yaml": "none", "verbose": 0, "mode": mode, "detector": "none"}  # fmt: skip
+    words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+    monkeypatch.setattr(sys, "argv", ["vslamlab_vslam.py", *words])
+    runpy.run_path(str(PACKAGING / "vslamlab" / "vslamlab_vslam.py"), run_name="__main__")
+    with (tmp_path / "00003_KeyFrameTrajectory.csv").open() as file:
+        table = list(csv.reader(file))
+    assert table[0] == ["ts (ns)", "tx (m)", "ty (m)", "tz (m)", "qx", "qy", "qz", "qw"]
+    found = np.array(table[1:], float)
+    np.testing.assert_allclose(found[:, 0] / 1e9, corridor.timestamps)
+    np.testing.assert_allclose(found[:, 1:4], scale * corridor.T_wc[:, :3, 3], atol=0.05 * scale)
+    turns = Rotation.from_quat(found[:, 4:]) * Rotation.from_matrix(corridor.T_wc[:, :3, :3]).inv()
+    assert turns.magnitude().max() < 0.01
+
+
+def test_the_baseline_names_tasks_and_options_that_exist(monkeypatch):
+    class Base:  # what VSLAM-LAB's class does with its arguments
+        def __init__(self, name: str, folder: str, parameters: dict[str, object]) -> None:
+            self.name, self.parameters = name, parameters
+            self.baseline_path = Path(folder)
+
+    module = SimpleNamespace(BaselineVSLAMLab=Base)
+    monkeypatch.setitem(sys.modules, "Baselines", SimpleNamespace())
+    monkeypatch.setitem(sys.modules, "Baselines.BaselineVSLAMLab", module)
+    program = runpy.run_path(str(PACKAGING / "vslamlab" / "baseline_vslam.py"))
+    baseline = program["VslamBaseline"]()
+    feature = tomllib.loads((PACKAGING / "vslamlab" / "pixi.toml").read_text())["feature"]
+    tasks = feature[baseline.name]["tasks"]
+    assert {f"execute-{mode}" for mode in baseline.modes} <= tasks.keys()
+    runner = (PACKAGING / "vslamlab" / "vslamlab_vslam.py").read_text()
+    assert all(f'"--{name}"' in runner for name in baseline.parameters if name != "verbose")
+    assert baseline.is_installed()[0] is False

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from vslam.config import Config
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.sides import balanced, compare_sides, with_pair
-from vslam.run.rig import measure_offset, offset_warnings, rig_warnings
+from vslam.run.rig import is_synchronised, measure_offset, offset_warnings, rig_warnings
 from vslam.types.camera import Camera
 from vslam.types.context import Context
 from vslam.types.features import Sides
@@ -219,7 +219,7 @@ def driven(delay_s: float = 0.0, turned_px: float = 0.0, n: int = 5000) -> Simpl
     )  # fmt: skip
     return SimpleNamespace(
         arrays=arrays, n_rows=n, n_keyframes=10, timestamps=times, sessions=np.zeros(10, int),
-        living_keyframes=lambda: np.arange(10),
+        living_keyframes=lambda: np.arange(10), scalars=SimpleNamespace(session=0),
     )  # fmt: skip
 
 
@@ -227,6 +227,16 @@ def test_residuals_tell_a_turned_side_from_a_late_one():
     assert measure_offset(driven(), CAMERA) == pytest.approx(0.0, abs=0.03)
     assert measure_offset(driven(turned_px=0.4), CAMERA) == pytest.approx(-0.4, abs=0.03)
     assert measure_offset(driven(delay_s=0.005), CAMERA) is None
+
+
+def test_a_map_shows_that_its_right_images_are_not_late():
+    assert is_synchronised(driven(), CAMERA)
+    assert is_synchronised(driven(turned_px=0.4), CAMERA)
+    assert not is_synchronised(driven(delay_s=0.0015), CAMERA)
+    assert not is_synchronised(driven(n=1000), CAMERA)
+    now = driven()
+    now.scalars.session = 1  # all keyframes are those of an earlier drive
+    assert not is_synchronised(now, CAMERA)
 
 
 def test_a_map_that_cannot_tell_says_nothing():

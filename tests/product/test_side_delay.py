@@ -17,6 +17,7 @@ from vslam.doctor.examine import examine
 from vslam.run.options import RunOptions
 from vslam.run.pair import PairCheck
 from vslam.run.side_delay import SideDelay, delay_warnings, fit_delay, measure_delay
+from vslam.slam import Slam
 from vslam.support.errors import UnreadableImageError
 from vslam.types.camera import Camera
 from vslam.types.geometry import se3_exp
@@ -142,6 +143,34 @@ def test_the_end_of_a_run_reports_a_late_camera():
     assert said_at_the_end(replace(late, live=True)) == ""
     assert said_at_the_end(source(0.0)) == ""
     assert "the right camera is" in said_at_the_end(source(0.0), "desync:10")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [0.0, 4e-3])
+def test_the_delay_is_measured_in_the_images_only_if_the_map_does_not_rule_it_out(
+    delay, monkeypatch
+):
+    def turning(t: float) -> np.ndarray:
+        T = ahead(t)
+        T[:3, :3] = Rotation.from_euler("y", 0.15 * np.sin(4.0 * t)).as_matrix() @ T[:3, :3]
+        return T
+
+    ahead = pose
+    monkeypatch.setitem(globals(), "pose", turning)
+    slam, late = Slam(CAMERA, detector="none", threads=1), source(delay)
+    for frame in late.stored:
+        slam.step(*frame.read(map), frame.timestamp)
+    slam.finish()
+    measured: list[int] = []
+    monkeypatch.setattr(
+        "vslam.run.pair.measure_delay", lambda frames, n: measured.append(n) or None
+    )
+    check = PairCheck(CAMERA, "images", RunOptions())
+    check.end(late, parse_perturbation("none", 0).bound_to(late), 60, slam.map)
+    assert measured == ([60] if delay else [])
+    check.end(late, parse_perturbation("none", 0).bound_to(late), 60)
+    assert len(measured) == (2 if delay else 1)  # without a map
+    assert check.warnings() == []
 
 
 def test_a_measurement_that_fails_does_not_end_the_run():

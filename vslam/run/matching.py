@@ -132,6 +132,9 @@ def joined(several: list[Matches]) -> Matches:
 
 def _with_contrast_of(image: Image, model: Image) -> Image:
     """Give an image the mean and the contrast of ``model``, as optical flow assumes."""
-    gain = float(model.std()) / max(float(image.std()), 1.0)
-    shifted = (image.astype(np.float32) - image.mean()) * gain + model.mean()
-    return np.clip(np.rint(shifted), 0, 255).astype(np.uint8)
+    (mean, spread), (wanted, contrast) = (
+        (float(mean[0, 0]), float(spread[0, 0]))
+        for mean, spread in map(cv2.meanStdDev, (image, model))
+    )
+    gain = contrast / max(spread, 1.0)
+    return np.asarray(cv2.addWeighted(image, gain, image, 0.0, wanted - gain * mean), np.uint8)

@@ -20,10 +20,12 @@ from vslam.datasets.frames import FIRST_FRAMES, Source, TimedFrame
 from vslam.datasets.perturbation import Perturbation, perturbed
 from vslam.run.matching import Described, Matches, describe, match_described
 from vslam.run.options import RunOptions
+from vslam.run.rig import is_synchronised
 from vslam.run.side_delay import FEWEST_FRAMES, delay_warnings, measure_delay
 from vslam.support.errors import InputError, UnreadableImageError, counted
 from vslam.support.plugins import reason
 from vslam.types.camera import Camera, Image
+from vslam.types.map import Map
 
 ROWS_PX = 0.8
 """Largest median vertical error of stereo matches. A run searches for stereo matches within 2 rows.
@@ -137,16 +139,22 @@ class PairCheck:
         """Return a sentence about a fault that was found, with a remedy."""
         return [said[-1] for said in self._found.values() if len(said) == _AGREEING] + self._late
 
-    def end(self, source: Source, perturbation: Perturbation, n_frames: int) -> None:
+    def end(
+        self, source: Source, perturbation: Perturbation, n_frames: int, map_: Map | None = None
+    ) -> None:
         """Measure the delay of the right image in the ``n_frames`` frames of the run, unless there
-        is another fault. The frames of a live camera cannot be read again."""
+        is another fault or the map of the run shows that there is no delay. The frames of a live
+        camera cannot be read again."""
         if self._camera.sensor != "stereo" or source.live or self.warnings():
             return
         try:
-            if n_frames >= FEWEST_FRAMES:
-                n_measured = n_frames if source.seekable else min(n_frames, FIRST_FRAMES)
-                found = measure_delay(perturbed(source.frames(), perturbation), n_measured)
-                self._late = delay_warnings(found, self._camera, self._config)
+            if n_frames < FEWEST_FRAMES or (
+                map_ is not None and is_synchronised(map_, self._camera)
+            ):
+                return
+            n_measured = n_frames if source.seekable else min(n_frames, FIRST_FRAMES)
+            found = measure_delay(perturbed(source.frames(), perturbation), n_measured)
+            self._late = delay_warnings(found, self._camera, self._config)
         except Exception as error:  # a failed check must not end the run
             self._late = [f"The delay of the right image could not be measured ({reason(error)})."]
 

@@ -106,7 +106,8 @@ def run_sequence(
         with run.recording_failure("saving the map"):
             autosave.close(slam, run.so_far, resumable=bool(end_reasons) and run.has_map)
     seconds = run.seconds()
-    pair.end(source, perturbation, len(run.tracks))
+    is_own = run.has_map and not run.settings.localize
+    pair.end(source, perturbation, len(run.tracks), slam.map if is_own else None)
     give_back_memory()  # the results are written from a copy of the map, which needs memory
     with run.recording_failure("the final trajectory"):
         if run.has_map:

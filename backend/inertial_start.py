@@ -38,7 +38,6 @@ from vslam.backend.inertial_filter import (
     TURN,
     N,
     corrected_by_pose,
-    inflated,
     propagated,
 )
 from vslam.backend.preintegration import Preintegration, preintegrate, so3_exp, so3_log
@@ -136,7 +135,7 @@ def find_gyro_bias(
     if motions is None or len(rotations) < 2:
         return None
     times = stretch.times - stretch.times[0]
-    noise = inflated(calibration.noise)
+    noise = calibration.noise
     C = stretch.sigma_rad**2 * np.eye(len(times))
     C += noise.gyro**2 * np.minimum.outer(times, times)
     L: Matrix = np.linalg.cholesky(C).astype(np.float64)
@@ -315,7 +314,7 @@ def _motions(
     """Return the motions from the first pose to each pose; None if samples are missing."""
     if not len(samples):
         return None
-    times, noise = stretch.times, inflated(calibration.noise)
+    times, noise = stretch.times, calibration.noise
     motions = [preintegrate(samples, float(times[0]), float(times[0]), noise, bias)]
     for before, now in itertools.pairwise(times.tolist()):
         motions.append(motions[-1].followed_by(preintegrate(samples, before, now, noise, bias)))
@@ -331,7 +330,7 @@ def _position_covariance(
     first, last = np.minimum.outer(times, times), np.maximum.outer(times, times)
     twice = first**2 * last / 2.0 - first**3 / 6.0
     thrice = first**3 * (10.0 * last**2 - 5.0 * first * last + first**2) / 120.0
-    noise = inflated(calibration.noise)
+    noise = calibration.noise
     C: Matrix = sigma_m**2 * np.eye(len(times)) + noise.accel**2 * twice
     return C + (GRAVITY * noise.gyro) ** 2 * thrice
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vslam.backend.inertial_factor import Motions
-from vslam.backend.inertial_filter import inflated
 from vslam.backend.preintegration import Preintegration, preintegrate
 from vslam.types.imu import InertialWindow
 from vslam.types.map import CARRIED, Map
@@ -36,7 +35,7 @@ def record_motion(map_: Map, keyframe: int, window: InertialWindow) -> None:
     start, end = map_.timestamps[[before, keyframe]].tolist()
     if start < samples[0, 0] or end - start > LONGEST_S:
         return
-    noise = inflated(window.noise)
+    noise = window.noise
     motion = preintegrate(samples, start, end, noise, window.state.bias)
     if motion.longest_gap > window.longest_gap:
         return

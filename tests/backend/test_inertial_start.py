@@ -9,24 +9,26 @@ import pytest
 from inertial import ADIS16448, DOWN, EUROC, Flight, recording
 
 from vslam.backend.inertial_filter import (
-    INFLATION,
+    MOTION,
+    VIBRATION,
+    anchored,
     camera_covariance,
     camera_pose,
     corrected_by_pose,
     corrected_by_rest,
+    drifted,
     in_another_world,
+    noise_in_motion,
     propagated,
 )
 from vslam.backend.inertial_start import GravityState, PoseStretch, find_gravity, find_gyro_bias
 from vslam.backend.preintegration import so3_log
 from vslam.types.geometry import inverse, se3_exp, se3_log
-from vslam.types.imu import GRAVITY, ImuCalibration, ImuNoise
+from vslam.types.imu import GRAVITY, ImuCalibration
 
 T_IMU_CAMERA = se3_exp(np.array([0.05, -0.02, 0.1, 0.2, 1.0, -1.5]))
 CALIBRATION = ImuCalibration(T_IMU_CAMERA, ADIS16448)
 BIAS = np.array([0.01, -0.02, 0.05, 0.05, -0.1, 0.08])
-# what a moving IMU's noise is modelled as
-MOVING = ImuNoise(INFLATION * ADIS16448.gyro, INFLATION * ADIS16448.accel)
 
 
 def stretch_of(flight, start, seconds, sigma=(0.0, 0.0), seed=0, scale=1.0, step=0.05):
@@ -63,7 +65,7 @@ def test_the_covariance_of_the_bias_is_that_of_repeated_noise():
     flight, errors = Flight(1), []
     for seed in range(100):
         stretch = stretch_of(flight, 0.2, 0.5, (0.003, 0.001), seed)
-        found = find_gyro_bias(stretch, samples_of(flight, noise=MOVING, seed=seed), CALIBRATION)
+        found = find_gyro_bias(stretch, samples_of(flight, noise=ADIS16448, seed=seed), CALIBRATION)
         errors.append(
             (found.bias - BIAS[:3]) @ np.linalg.solve(found.covariance, found.bias - BIAS[:3])
         )
@@ -94,7 +96,7 @@ def test_at_rest_gravity_is_found_without_any_motion():
     flight = Flight(3, speed=0.0, turning=0.0)
     found = find_gravity(
         stretch_of(flight, 0.2, 0.5, (0.002, 0.0005)),
-        samples_of(flight, np.zeros(6), MOVING),
+        samples_of(flight, np.zeros(6), ADIS16448),
         CALIBRATION,
         known_scale=True,
     )
@@ -105,7 +107,7 @@ def test_at_rest_gravity_is_found_without_any_motion():
 
 def test_one_camera_gets_its_scale_when_the_motion_tells_it():
     flight = Flight(4, speed=3.0)
-    samples = samples_of(flight, noise=MOVING)
+    samples = samples_of(flight, noise=ADIS16448)
     stretch = stretch_of(flight, 0.2, 3.0, (0.002, 0.0003), scale=2.5)
     found = find_gravity(stretch, samples, CALIBRATION, known_scale=False)
     assert found.doubt == ""
@@ -119,7 +121,7 @@ def test_the_noise_of_poses_does_not_make_the_scale_too_small():
     for seed in range(40):
         flight = Flight(seed, speed=0.3, turning=0.3)
         stretch = stretch_of(flight, 0.2, 2.0, (0.004, 0.0005), seed, scale=2.5)
-        samples = samples_of(flight, noise=MOVING, seed=seed)
+        samples = samples_of(flight, noise=ADIS16448, seed=seed)
         found = find_gravity(stretch, samples, CALIBRATION, known_scale=False)
         errors.append(np.log(found.scale / 2.5))
         squares.append((errors[-1] / found.scale_sigma) ** 2)
@@ -158,7 +160,7 @@ def test_a_gap_in_the_samples_is_refused():
 
 
 def started(flight, seed, seconds=0.6) -> tuple[GravityState, np.ndarray]:
-    samples = samples_of(flight, noise=MOVING, seed=seed)
+    samples = samples_of(flight, noise=ADIS16448, seed=seed)
     stretch = stretch_of(flight, 0.2, seconds, (0.003, 0.001), seed)
     found = find_gravity(stretch, samples, CALIBRATION, known_scale=True)
     assert found.doubt == ""
@@ -199,6 +201,41 @@ def test_the_covariance_is_that_of_the_errors_in_the_light_and_in_the_dark():
             kept.append(moving @ np.linalg.solve(P, moving))
     assert 5.0 < np.mean(light) < 13.0  # 9 are expected
     assert 5.0 < np.mean(dark) < 13.0
+
+
+def test_at_rest_the_noise_is_that_of_the_data_sheet():
+    rest = Flight(2, speed=0.0, turning=0.0)
+    noise = noise_in_motion(ADIS16448, samples_of(rest, np.zeros(6), ADIS16448))
+    assert noise.gyro == pytest.approx(ADIS16448.gyro, rel=0.1)
+    assert noise.accel == pytest.approx(ADIS16448.accel, rel=0.1)
+    assert noise.accel_walk == ADIS16448.accel_walk
+
+
+def test_shares_of_motion_and_vibration_count_as_noise_also_if_samples_are_missing():
+    samples = np.zeros((400, 7))
+    samples[:, 0] = np.arange(400) * 0.005
+    samples[:, 1:] = (0.5, 0.0, 0.0, 0.0, 0.0, GRAVITY)
+    samples[:, 4:] += 0.5 * np.random.default_rng(0).standard_normal((len(samples), 3))
+    shares = np.array([VIBRATION * 0.5 * np.sqrt(0.005), MOTION * 0.5 * np.sqrt(3.0)])
+    accel = np.linalg.norm([ADIS16448.accel, *shares])
+    for rows in (samples, np.delete(samples, slice(-100, -60), axis=0)):
+        noise = noise_in_motion(ADIS16448, rows)
+        assert noise.accel == pytest.approx(accel, rel=0.2)
+        assert noise.gyro == pytest.approx(np.hypot(ADIS16448.gyro, MOTION * 0.5), rel=0.05)
+    assert noise_in_motion(ADIS16448, samples[:3]) == ADIS16448
+
+
+def test_a_drift_of_the_world_changes_nothing_in_the_frame_of_the_imu():
+    """Gravity and velocity, seen from the IMU, stay as uncertain as they were."""
+    found, _ = started(Flight(1), 1)
+    A = np.random.default_rng(0).standard_normal((6, 6))
+    before, given = found.state, A @ A.T * 1e-4
+    after = drifted(before, given, T_IMU_CAMERA)
+    added = camera_covariance(after, T_IMU_CAMERA) - camera_covariance(before, T_IMU_CAMERA)
+    assert np.allclose(added, given, atol=1e-12)
+    at = before.T_world_imu
+    seen = [anchored(state, at).covariance[6:, 6:] for state in (before, after)]
+    assert np.allclose(*seen, atol=1e-12)
 
 
 def test_in_the_dark_the_state_follows_the_samples():
@@ -254,12 +291,15 @@ def test_a_second_of_a_real_flight_carries_the_camera_through_the_dark(name):
     flight, errors = recording(name), []
     for k, start in enumerate(np.linspace(flight.times[0] + 12.0, flight.times[-1] - 7.0, 30)):
         stretch = stretch_of(flight, start, 1.0, (0.003, 0.0005), k)
-        found = find_gravity(stretch, flight.samples, CALIBRATION, known_scale=True)
+        until = flight.samples[flight.samples[:, 0] <= stretch.times[-1]]
+        noise = noise_in_motion(ADIS16448, until)
+        calibration = ImuCalibration(T_IMU_CAMERA, noise)
+        found = find_gravity(stretch, flight.samples, calibration, known_scale=True)
         assert found.doubt == ""
         row = [degrees_between(found.state.gravity, DOWN)]
         for seconds in (0.5, 1.0):
             end = found.state.timestamp + seconds
-            dark = propagated(found.state, flight.samples, end, ADIS16448)
+            dark = propagated(found.state, flight.samples, end, noise)
             apart = inverse(flight.pose(end)) @ dark.T_world_imu
             row += [np.linalg.norm(apart[:3, 3]), np.degrees(np.linalg.norm(se3_log(apart)[3:]))]
         errors.append(row)

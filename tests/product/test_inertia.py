@@ -145,7 +145,7 @@ def test_one_frame_in_the_light_corrects_what_the_dark_has_spoilt():
         for a, b in ((19, 39), (40, 58))
     )
     assert np.linalg.norm(first[:3, 3]) > 0.08
-    assert np.linalg.norm(second[:3, 3]) < 0.04  # 0.17 m if the velocity stays wrong
+    assert np.linalg.norm(second[:3, 3]) < 0.05  # 0.17 m if the velocity stays wrong
 
 
 def test_a_slow_camera_gets_gravity_from_more_than_a_second():

@@ -21,15 +21,17 @@ from numpy.typing import ArrayLike
 
 from vslam.backend.inertial_filter import (
     FALL,
+    SPEED,
     TURN,
     anchored,
     camera_covariance,
     camera_pose,
     corrected_by_pose,
     corrected_by_rest,
+    drifted,
     in_another_world,
-    inflated,
     moved,
+    noise_in_motion,
 )
 from vslam.backend.inertial_start import MAX_MISFIT, GravityState, PoseStretch, find_gravity
 from vslam.backend.preintegration import cross_matrix, preintegrate, so3_log
@@ -40,10 +42,12 @@ from vslam.types.imu import (
     GRAVITY,
     GravityDirection,
     ImuCalibration,
+    ImuNoise,
     Inertia,
     InertialState,
     tidied,
 )
+from vslam.types.odometry import KEYFRAME_DRIFT
 
 CARRIED_S = 3.0  # s without images after which a pose counts as lost, not as carried by the IMU
 # The start needs poses over START_S seconds. It is tried again every RETRY_S seconds, with the
@@ -61,22 +65,29 @@ SCALE_STRETCHES, GUESS_SIGMA = (8.0, 4.0, 2.0), 0.25
 RETRY_SHARE, SCALE_RETRY_S = 0.25, (0.5, 2.0)
 KEPT_WITHOUT_SCALE_S = 30.0  # s for which samples are kept while the scale is unknown
 METRIC_S = 2.0  # s of poses in metres that give the first state of one camera
-# Standard deviation of a feature in the image, as seen in the errors of the poses of one camera.
-SIGMA_PX = 0.15
-# Standard deviations of poses by images at the start, along each axis: metres and radians. Errors
-# of the covariances that the images give are not independent from frame to frame, so those
-# covariances are multiplied by POSE_INFLATION, and are at least as large as these.
-SIGMA_M, SIGMA_RAD = 0.002, 0.0005
-SIGMA_PER_M = 0.005  # share of the distance between two frames, if that is larger than SIGMA_M
+# Standard deviations of a feature in the image and of a rotation, in pixels and radians, as seen in
+# the errors of the poses of one camera.
+SIGMA_PX, SCALE_SIGMA_RAD = 0.15, 0.0005
+# Errors of the covariances that the images give are not independent from frame to frame, so those
+# covariances are multiplied by POSE_INFLATION, and are at least as large as these, in metres and
+# radians along each axis.
 POSE_INFLATION = 4.0
+SIGMA_M, SIGMA_RAD = 0.001, 0.0002
+SIGMA_PER_M = 0.005  # share of the distance between two frames, if that is larger, at the start
+# Factor of the noise of the samples in bundle adjustment, where the filter tells gravity and the
+# biases, which it has learned from the same images, and beside poses that it has improved. With 1,
+# some straight paths get 0.3 % too long, and with 10, the samples improve little. [own]
+BUNDLES = 3.0
 _TURN_AND_FALL = np.ix_(*[np.r_[TURN, FALL]] * 2)
 REST_SIGMA = 0.01  # m/s, standard deviation of the velocity of a camera that stands still
 # A camera that stood still has moved off if the samples of a frame show more than this, in m/s^2
 # and rad/s. A car gains 1 m/s^2.
 REST_ACCEL, REST_RATE = 0.1, 0.02
-# A pose with a larger squared distance from its prediction is not used: 0.001 of six degrees of
-# freedom. After so many such poses in a row, the state is found anew.
-IMPLAUSIBLE, MOST_REFUSED = 22.5, 5
+# A pose with a larger squared distance from its prediction contradicts it: 0.001 of six degrees of
+# freedom. The motion of the prediction is then less certain than it claims, and its variances are
+# multiplied by these factors, until the pose agrees. If none helps, the pose is not used. After so
+# many such poses in a row, the state is found anew.
+IMPLAUSIBLE, DOUBTS, MOST_REFUSED = 22.5, (1.0, 10.0, 100.0), 5
 # After so many disagreements, the IMU is not used. A disagreement is a start at which poses and
 # samples did not agree, or a state that had to be found anew. They are forgotten if a state has
 # agreed with the poses for AGREED_S seconds.
@@ -127,9 +138,15 @@ def predicted_state(
     state = inertia.state
     if state is None or not len(inertia.samples) or not timestamp > state.timestamp:
         return None
-    noise = inflated(calibration.noise)
+    noise = noise_in_motion(calibration.noise, inertia.samples)
     motion = preintegrate(inertia.samples, state.timestamp, timestamp, noise, state.bias)
     return moved(state, motion, noise) if motion.longest_gap <= LONGEST_GAP else None
+
+
+def noise_for_bundles(inertia: Inertia, calibration: ImuCalibration) -> ImuNoise:
+    """Return the noise of the samples for bundle adjustment."""
+    noise = noise_in_motion(calibration.noise, inertia.samples)
+    return replace(noise, gyro=BUNDLES * noise.gyro, accel=BUNDLES * noise.accel)
 
 
 def tracked(
@@ -153,20 +170,31 @@ def tracked(
     if is_refused(inertia):
         return inertia
     if predicted is None:  # unknown, or samples are missing
-        return _started(_collected(inertia, timestamp, T_odom_camera), calibration)
-    noise = _noise(covariance)
-    found = corrected_by_pose(predicted, T_odom_camera, noise, calibration.T_imu_camera)
-    if not found.chi2 <= IMPLAUSIBLE:
+        inertia = _collected(inertia, timestamp, T_odom_camera)
+        return _started(inertia, _noise(covariance), calibration)
+    state = _corrected(predicted, T_odom_camera, covariance, calibration)
+    if state is None:
         if inertia.refused + 1 >= MOST_REFUSED:
             n = inertia.disagreements + 1
             return replace(_forgotten(inertia), refused=0, disagreements=n)
         return replace(inertia, state=predicted, refused=inertia.refused + 1)
-    state = found.state
     if stands_still:
         state = corrected_by_rest(state, REST_SIGMA).state
     agreed = timestamp - inertia.tried > AGREED_S
     n = 0 if agreed else inertia.disagreements
     return replace(inertia, state=state, refused=0, disagreements=n)
+
+
+def at_keyframe(inertia: Inertia, covariance: Matrix, calibration: ImuCalibration) -> Inertia:
+    """Return what is known after a frame became a keyframe, with which the odometry drifts.
+
+    Args:
+        covariance: ``(6, 6)`` of the pose of the frame (``PoseUncertainty.local``).
+    """
+    if inertia.state is None:
+        return inertia
+    drift = KEYFRAME_DRIFT * covariance
+    return replace(inertia, state=drifted(inertia.state, drift, calibration.T_imu_camera))
 
 
 def found_again(
@@ -194,10 +222,7 @@ def found_again(
         return replace(_forgotten(inertia), carried_s=0.0)
     state = predicted
     if T_odom_seen is not None:
-        noise = _noise(covariance)
-        found = corrected_by_pose(predicted, T_odom_seen, noise, calibration.T_imu_camera)
-        if found.chi2 <= IMPLAUSIBLE:
-            state = found.state
+        state = _corrected(predicted, T_odom_seen, covariance, calibration) or predicted
     T_odom_imu = T_odom_camera @ inverse(calibration.T_imu_camera)
     return replace(inertia, state=anchored(state, T_odom_imu), carried_s=0.0, refused=0)
 
@@ -250,12 +275,13 @@ def guessed_scale(
     now, since = float(times[-1]), float(times[0])
     if now - inertia.tried < np.clip(RETRY_SHARE * (now - since), *SCALE_RETRY_S):
         return inertia, None
+    doubted = replace(calibration, noise=noise_for_bundles(inertia, calibration))
     for seconds in SCALE_STRETCHES:
         if now - since < 0.5 * seconds:
             continue
         chosen = times >= now - seconds
-        stretch = PoseStretch(times[chosen], run.T_wc[chosen], sigma, SIGMA_RAD)
-        found = find_gravity(stretch, inertia.samples, calibration, known_scale=False)
+        stretch = PoseStretch(times[chosen], run.T_wc[chosen], sigma, SCALE_SIGMA_RAD)
+        found = find_gravity(stretch, inertia.samples, doubted, known_scale=False)
         if found is None or not found.scale_sigma <= GUESS_SIGMA:
             continue
         if best is None or found.scale_sigma < best.scale_sigma:
@@ -281,8 +307,9 @@ def in_metres(
     """
     now = float(run.times[-1])
     chosen = run.times >= now - METRIC_S
-    stretch = PoseStretch(run.times[chosen], run.T_wc[chosen], sigma, SIGMA_RAD)
-    found = find_gravity(stretch, inertia.samples, calibration, known_scale=True)
+    stretch = PoseStretch(run.times[chosen], run.T_wc[chosen], sigma, SCALE_SIGMA_RAD)
+    doubted = replace(calibration, noise=noise_for_bundles(inertia, calibration))
+    found = find_gravity(stretch, inertia.samples, doubted, known_scale=True)
     metric = replace(
         _forgotten(inertia),
         scale_sigma=scale_sigma,
@@ -330,6 +357,22 @@ def gravity_direction(state: InertialState, calibration: ImuCalibration) -> Grav
     return GravityDirection(direction, float(np.sqrt(across / 2.0)))
 
 
+def _corrected(
+    predicted: InertialState, T_odom_camera: Matrix, covariance: Matrix, calibration: ImuCalibration
+) -> InertialState | None:
+    """Return a predicted state, corrected by a pose of the images; None if they contradict each
+    other."""
+    noise = _noise(covariance)
+    for doubt in DOUBTS:
+        D = np.ones(len(predicted.covariance))
+        D[: SPEED.stop] = np.sqrt(doubt)  # what is known of gravity and the biases remains
+        doubted = replace(predicted, covariance=predicted.covariance * np.outer(D, D))
+        found = corrected_by_pose(doubted, T_odom_camera, noise, calibration.T_imu_camera)
+        if found.chi2 <= IMPLAUSIBLE:
+            return found.state
+    return None
+
+
 def _noise(covariance: Matrix) -> Matrix:
     """Return the ``(6, 6)`` covariance with which a pose of the images corrects the state."""
     noise: Matrix = POSE_INFLATION * covariance
@@ -351,8 +394,9 @@ def _collected(inertia: Inertia, timestamp: float, T_odom_camera: Matrix) -> Ine
     return replace(inertia, state=None, times=times[recent], poses=poses[recent])
 
 
-def _started(inertia: Inertia, calibration: ImuCalibration) -> Inertia:
-    """Try to find the state from the stretch."""
+def _started(inertia: Inertia, noise: Matrix, calibration: ImuCalibration) -> Inertia:
+    """Try to find the state from the stretch. The newest pose has the ``(6, 6)`` covariance
+    ``noise``."""
     times = inertia.times
     now = float(times[-1])
     if now - times[0] < START_S or now - inertia.tried < RETRY_S:
@@ -361,9 +405,11 @@ def _started(inertia: Inertia, calibration: ImuCalibration) -> Inertia:
     step = -(-len(times) // MOST_POSES)
     chosen = slice((len(times) - 1) % step, None, step)  # the newest pose belongs to them
     moved = np.linalg.norm(np.diff(inertia.poses[:, :3, 3], axis=0), axis=1)
-    sigma_m = max(SIGMA_M, SIGMA_PER_M * float(np.median(moved)))
-    stretch = PoseStretch(times[chosen], inertia.poses[chosen], sigma_m, SIGMA_RAD)
-    found = find_gravity(stretch, inertia.samples, calibration, known_scale=True)
+    sigma_m, sigma_rad = np.sqrt(np.diag(noise).reshape(2, 3).mean(axis=1)).tolist()
+    sigma_m = max(sigma_m, SIGMA_PER_M * float(np.median(moved)))
+    stretch = PoseStretch(times[chosen], inertia.poses[chosen], sigma_m, sigma_rad)
+    moving = replace(calibration, noise=noise_in_motion(calibration.noise, inertia.samples))
+    found = find_gravity(stretch, inertia.samples, moving, known_scale=True)
     if found is None:
         return inertia
     if found.doubt:

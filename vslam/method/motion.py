@@ -27,6 +27,7 @@ from vslam.method.inertia import (
     in_metres,
     is_refused,
     lost,
+    noise_for_bundles,
     predicted_covariance,
     predicted_motion,
     predicted_state,
@@ -34,6 +35,7 @@ from vslam.method.inertia import (
     with_samples,
     without_scale,
 )
+from vslam.method.inertia import at_keyframe as drifted_at_keyframe
 from vslam.method.inertia import found_again as anew
 from vslam.types.context import Context
 from vslam.types.features import TrackingState, TrackResult
@@ -299,8 +301,8 @@ class Motion:
         if camera.quarter_turns:
             T = camera.T_mounted_camera
             R_odom_camera, T_imu_camera = R_odom_camera @ T[:3, :3], T_imu_camera @ T
-        samples = self.state.inertia.samples
-        return InertialWindow(samples, state, R_odom_camera, T_imu_camera, imu.noise, LONGEST_GAP)
+        samples, noise = self.state.inertia.samples, noise_for_bundles(self.state.inertia, imu)
+        return InertialWindow(samples, state, R_odom_camera, T_imu_camera, noise, LONGEST_GAP)
 
     def turn_between(self, start: float, end: float) -> KnownTurn | None:
         """Return the rotation of the camera between two times, in seconds, as the gyroscope
@@ -343,6 +345,9 @@ class Motion:
         inertia, carried = self.state.inertia, track.state == TrackingState.INERTIAL
         if self._context.camera.monocular and self.state.lost_frames and not carried:
             inertia = without_scale(inertia)
+        if self._imu is not None:
+            local = self.state.odometry.now.local
+            inertia = drifted_at_keyframe(inertia, local, self._imu)
         self.state = MotionState(at_keyframe(self.state.odometry), 0, inertia)
 
     def resume(self, twist: Matrix | None = None) -> None:

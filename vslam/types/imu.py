@@ -268,7 +268,7 @@ class InertialWindow:
         state: the state of the IMU, in the frame of the odometry.
         R_odom_camera: ``(3, 3)`` rotation of the tracked camera in the frame of the odometry.
         T_imu_camera: ``(4, 4)``, maps points of the tracked camera to the IMU.
-        noise: of the IMU at rest.
+        noise: of the samples, see ``noise_in_motion``.
         longest_gap: seconds between two samples above which they do not tell the motion.
     """
 

@@ -40,6 +40,8 @@ from vslam.types.geometry import Matrix, adjoint, inverse, orthonormalised, se3_
 # errors over intervals of 1 s and 10 s match the covariances. They were tested on other drives
 # (docs/research/uncertainty.md).
 DRIFT, CORRELATION = 1.4, 0.4
+# The same for a sum over many keyframes, as a multiple of the covariance of one.
+KEYFRAME_DRIFT = DRIFT * (1.0 + CORRELATION) / (1.0 - CORRELATION)
 # Standard deviations, for each axis, of a motion that is predicted with constant velocity: the
 # acceleration in m/s^2 and rad/s^2, the largest change of the turn rate in rad/s, the rotation in
 # rad if nothing is known, and the speed in m/s if it is unknown. For predictions over 0.2 to 16 s

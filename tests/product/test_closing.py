@@ -13,6 +13,7 @@ from ring import CAMERA, LAP, Oracle, Ring
 from vslam.backend import pose_graph
 from vslam.backend.loop_correction import move_keyframes
 from vslam.backend.pose_graph import GAP, WEAK, connectivity, essential_graph, optimise
+from vslam.backend.similarity_graph import scale_of
 from vslam.config import Config, ConsistencyConfig, KeyframeConfig, LoopConfig
 from vslam.loopclosure.detector import NoDetector
 from vslam.loopclosure.verification import verify
@@ -396,9 +397,18 @@ def test_a_loop_keeps_the_map_level_where_gravity_is_known():
     graph = essential_graph(map_, [edge], Config().pose_graph, driven=True)
     assert plain.T_cw.tobytes() == optimise(graph, Config().pose_graph).tobytes()
     map_.keyframes.gravity[living], map_.keyframes.gravity_sigma[living] = felt, 0.002
-    _, level = solved()
+    level_solution, level = solved()
     assert tilted > 0.4
     assert level < 0.25 * tilted
+    # The scale of one camera cannot drift if an IMU made its map metric and the loop agrees.
+    config, known = Config().pose_graph, replace(map_.scalars, metric=True)
+    metric = copy.deepcopy(map_)
+    metric.scalars = known
+    other = replace(edge, scale=1.2)
+    for kept, one in ((True, edge), (False, other)):
+        one_camera = solve(metric, [], one, Hypothesis.PREDICTED, config, monocular=True)
+        assert (one_camera.T_cw.tobytes() == level_solution.T_cw.tobytes()) == kept
+        assert np.allclose(scale_of(one_camera.S_wc), 1.0) == kept
 
 
 @pytest.mark.parametrize("threads", [1, 2])

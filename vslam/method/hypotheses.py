@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from vslam.backend.pose_graph import (
     COVISIBLE,
     GAP,
+    LOOP,
     TREE,
     WEAK,
     GraphCheck,
@@ -51,6 +52,9 @@ class Hypothesis(Enum):
     MISTRACKED = "it did not move as tracked"
 
 
+# Largest scale that a loop of a metric map measures, as a natural logarithm: three standard
+# deviations of the scale of a loop (``similarity_graph``). [own]
+SAME_SCALE = 0.06
 WEAK_PLACE = 0.3  # fraction of the shared landmarks that are usual in the map
 # Standard deviations of the odometry across a weak place: metres and radians.
 DOUBTFUL_SIGMAS = np.array([100.0, 100.0, 100.0, 1.0, 1.0, 1.0])
@@ -98,7 +102,8 @@ def solve(
     Args:
         closed: loops that were closed before, in the current unit of the map.
         edge: the new loop, whose relative pose is known.
-        monocular: optimise similarities instead of rigid motions, because the scale drifts.
+        monocular: optimise similarities instead of rigid motions, because the scale drifts, unless
+            an IMU keeps the scale.
     """
     predicted = hypothesis is not Hypothesis.KIDNAPPED
     graph = essential_graph(map_, [*closed, edge], config, driven=predicted)
@@ -109,7 +114,7 @@ def solve(
         # With a robust loss, a loop that is far from fulfilled would have no influence.
         config = config.model_copy(update={"robust_scale": 1e6})
     T_cw = map_.arrays.T_cw[: map_.n_keyframes]
-    if monocular:
+    if monocular and not _keeps_scale(map_, graph):
         S_wc = inverses(T_cw) if predicted else _aligned_similarities(map_, closed, edge)
         start = S_wc[graph.keyframes]
         found = optimise_similarities(graph, start, config)
@@ -123,6 +128,13 @@ def solve(
     if verdict.consistent and level.gravity_sigma.any():
         found = optimise_level(level, config)
     return Solution(graph, found, inverses(found), verdict, mistracked)
+
+
+def _keeps_scale(map_: Map, graph: PoseGraph) -> bool:
+    """Return whether an IMU has kept the scale of a monocular map: it is metric, and no loop
+    measured another scale. The scale of a sub-map whose unit is unknown is another one."""
+    measured = np.log(graph.scale[graph.kind == LOOP])
+    return map_.scalars.metric and bool((np.abs(measured) <= SAME_SCALE).all())
 
 
 def _weak_places(map_: Map) -> NDArray[np.int64]:

@@ -21,7 +21,7 @@ from vslam.maps.storage import load_checkpoint, load_map, save_map
 from vslam.maps.stored_map import StoredMap, TruthAlignment
 from vslam.method.gaps import Gap, find_gaps
 from vslam.method.hypotheses import map_gravity
-from vslam.method.inertia import IMU_REFUSED, SCALE_UNKNOWN, is_refused
+from vslam.method.inertia import IMU_REFUSED, SCALE_LOST, SCALE_UNKNOWN, is_refused
 from vslam.method.map_frames import in_first_part, keyframe_trajectory
 from vslam.method.session import Session
 from vslam.support.errors import InputError
@@ -352,7 +352,7 @@ class Slam:
         """
         of_imu = [IMU_REFUSED] if is_refused(self._session.inertia) else []
         if self._session.lacks_scale:
-            of_imu.append(SCALE_UNKNOWN)
+            of_imu.append(SCALE_UNKNOWN if self.metric_since is None else SCALE_LOST)
         return [*self._session.closing.problems, *self.rig.problems, *of_imu]
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,7 @@ from inertial import ADIS16448, EUROC, Walk, seen_by
 from vslam.backend.metric_mapping import scale_of_map
 from vslam.datasets.euroc import open_euroc
 from vslam.datasets.imu import ImuFeed
-from vslam.method.inertia import SCALE_UNKNOWN
+from vslam.method.inertia import SCALE_LOST, SCALE_UNKNOWN, without_scale
 from vslam.slam import Slam
 from vslam.types.camera import Camera
 from vslam.types.features import TrackingState
@@ -138,6 +139,14 @@ def test_a_drive_that_is_continued_from_a_file_keeps_its_scale_to_the_byte(drive
         new = rows[(rows[:, 0] > TIMES[k - 1]) & (rows[:, 0] <= TIMES[k])]
         result = slam.step(drive.images[k], None, TIMES[k], imu=new)
         assert result.T_wc.tobytes() == drive.results[k].T_wc.tobytes()
+
+
+def test_a_sub_map_whose_scale_is_unknown_is_said(drive):
+    slam = Slam.load(drive.file, resume=True, threads=1, imu=CALIBRATION)
+    assert slam.problems == []
+    motion = slam._session._motion
+    motion.state = replace(motion.state, inertia=without_scale(motion.state.inertia))
+    assert slam.problems == [SCALE_LOST]
 
 
 def test_an_unseen_scene_after_the_dark_is_metric_and_belongs_to_the_same_map(drive):

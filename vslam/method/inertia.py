@@ -102,6 +102,10 @@ SCALE_UNKNOWN = (
     "The unit of length is not the metre, because the camera did not accelerate enough for the IMU "
     "to tell the scale: begin with a few quick movements."
 )
+SCALE_LOST = (
+    "The unit of length of the last sub-map is not the metre, because the camera did not "
+    "accelerate enough after it had been lost: its distances are not those of the rest of the map."
+)
 
 
 def is_refused(inertia: Inertia) -> bool:

@@ -153,7 +153,7 @@ def drive_of(
     kept = (samples[:, 0] >= shift - 1e-9) & (samples[:, 0] <= shift + part.timestamps[-1] + 1e-9)
     samples = samples[kept]
     samples[:, 0] -= shift
-    depth = sensor != "stereo"  # so that both other sensors share the images
+    depth = sensor == "rgbd"
     cache = cache / "depth" if depth else cache
     root = render_sequence(part, Variation(seed=seed), cache, depth=depth)
     source = open_kitti(root, part.name, every=every)
@@ -194,13 +194,15 @@ def run_orbslam3(drive: Drive, *, imu: bool) -> Run:
     """Run ORB-SLAM3 in another interpreter ($ORBSLAM3_PYTHON), at the pace of the camera."""
     camera = drive.source.camera
     root = [frame.file for frame in drive.source.frames()]
+    second = "depth_0" if drive.sensor == "rgbd" else "image_1"
     with tempfile.TemporaryDirectory() as folder:
         job, out = Path(folder, "job.npz"), Path(folder, "out.npz")
         np.savez(
             job,
             left=[str(file) for file in root],
-            right=[str(file).replace("image_0", "image_1") for file in root],
+            right=[str(file).replace("image_0", second) for file in root],
             times=drive.times, samples=drive.samples, dark=drive.dark, imu=imu,
+            sensor=drive.sensor,
             camera=[camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
                     camera.bf],
             T_imu_camera=drive.imu.T_imu_camera,
@@ -237,6 +239,16 @@ def ate(estimate: Float, truth: Float) -> float:
     turn, _ = Rotation.align_vectors(q - q.mean(0), p - p.mean(0))
     apart = turn.apply(p - p.mean(0)) - (q - q.mean(0))
     return float(np.sqrt((apart**2).sum(axis=1).mean()))
+
+
+def scale_error(estimate: Float, truth: Float) -> float:
+    """Return by how much the best scale of an estimate differs from 1 (Umeyama, 1991)."""
+    known = ~np.isnan(estimate[:, 0, 3])
+    if known.sum() < 3:
+        return np.nan
+    p, q = estimate[known, :3, 3], truth[known, :3, 3]
+    p, q = p - p.mean(0), q - q.mean(0)
+    return float(np.linalg.svd(q.T @ p)[1].sum() / np.sum(p**2) - 1.0)
 
 
 def rpe(estimate: Float, truth: Float, frames: int) -> tuple[float, float]:

@@ -1,7 +1,11 @@
 """Compare ordinary drives with and without the IMU: it must not make them worse.
 
     python tools/experiments/inertial/never_worse.py --out never_worse.csv
+    python tools/experiments/inertial/never_worse.py --sensors stereo mono rgbd --out sensors.csv
 
+Errors are those of the frames since the first one that was tracked, after a rigid alignment, also
+of one camera. ``scale`` is by how much a similarity would scale the poses. ``lost`` counts lost
+frames after the first one that was tracked, whose time is ``first_s``.
 ``rpe_m`` and ``rpe_deg`` are errors of the motion over one second. ``gravity_2s_deg`` is the error
 of gravity two seconds after it was found, and ``gravity_deg`` the largest one from then on.
 """
@@ -9,10 +13,11 @@ of gravity two seconds after it was found, and ``gravity_deg`` the largest one f
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from drives import SYSTEMS, Run, ate, built_in, drive_of, rpe, write_rows
+from drives import SYSTEMS, Drive, Run, ate, built_in, drive_of, rpe, scale_error, write_rows
 
 from vslam_lab.towns import Route, cache_folder
 
@@ -20,6 +25,7 @@ DRIVES = (
     ("room", 25), ("room", 26), ("hall", 25), ("hall", 26), ("walk", 25), ("walk", 26),
     ("drone", 25), ("demo", 25), ("00", 25), ("03", 25),
 )  # fmt: skip
+OF_SENSORS = ("room", 60), ("hall", 60), ("walk", 60), ("drone", 60), ("demo", 60)
 SECONDS = 14.0
 
 
@@ -40,27 +46,42 @@ def main() -> None:
     parser.add_argument("--towns", type=Path, default=cache_folder())
     parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=["vslam"])
     parser.add_argument("--first", type=int, default=len(DRIVES), help="only the first drives")
+    parser.add_argument("--sensors", nargs="+", choices=("stereo", "mono", "rgbd"))
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     rows: list[dict[str, object]] = []
-    for name, seed in DRIVES[: options.first]:
+    drives, sensors = (OF_SENSORS if options.sensors else DRIVES), options.sensors or ["stereo"]
+    for name, seed in drives[: options.first]:
         route = built_in(name, seed)
         frames = slice(0, round(SECONDS * route.rate))
-        drive = drive_of(route, seed, options.towns, frames=frames)
-        for system in options.systems:
-            for imu in (True, False):
-                run = SYSTEMS[system](drive, imu=imu)
-                metres, degrees = rpe(run.final, drive.T_wc, round(route.rate))
-                since, soon, later = gravity_errors(run, route)
-                rows.append({
-                    "drive": f"{name}, seed {seed}", "system": system,
-                    "imu": "yes" if imu else "no",
-                    "frames": len(drive.times), "lost": int(run.lost.sum()),
-                    "ate_m": ate(run.final, drive.T_wc), "rpe_m": metres, "rpe_deg": degrees,
-                    "gravity_since_s": since, "gravity_2s_deg": soon, "gravity_deg": later,
-                })  # fmt: skip
-                print(rows[-1], flush=True)
+        for sensor in sensors:
+            made = "rgbd" if options.sensors else "stereo"  # all sensors share the images
+            drive = drive_of(route, seed, options.towns, frames=frames, sensor=made)
+            drive = replace(drive, sensor=sensor)
+            for system in options.systems:
+                for imu in (True, False):
+                    run = SYSTEMS[system](drive, imu=imu)
+                    rows.append({
+                        "drive": f"{name}, seed {seed}", "sensor": sensor, "system": system,
+                        "imu": "yes" if imu else "no", **measured(run, drive, route),
+                    })  # fmt: skip
+                    print(rows[-1], flush=True)
     write_rows(options.out, rows)
+
+
+def measured(run: Run, drive: Drive, route: Route) -> dict[str, object]:
+    """Return the errors of a run."""
+    tracked = ~run.lost
+    first = int(np.argmax(tracked)) if tracked.any() else 0
+    final, truth = run.final[first:], drive.T_wc[first:]
+    metres, degrees = rpe(final, truth, round(route.rate))
+    since, soon, later = gravity_errors(run, route)
+    return {
+        "frames": len(drive.times), "lost": int(run.lost[first:].sum()),
+        "first_s": first / route.rate, "ate_m": ate(final, truth),
+        "scale": scale_error(final, truth), "rpe_m": metres, "rpe_deg": degrees,
+        "gravity_since_s": since, "gravity_2s_deg": soon, "gravity_deg": later,
+    }  # fmt: skip
 
 
 if __name__ == "__main__":

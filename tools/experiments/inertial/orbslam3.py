@@ -37,6 +37,7 @@ IMU.GyroWalk: {noise[2]}
 IMU.AccWalk: {noise[3]}
 IMU.Frequency: 200
 IMU.fastInit: 1
+RGBD.DepthMapFactor: 1.0
 Tbc: !!opencv-matrix
    rows: 4
    cols: 4
@@ -60,6 +61,9 @@ Viewer.ViewpointF: 500.0
 """
 
 
+CENTIMETRES = 100.0  # of depth images, in a metre
+
+
 def main(vocabulary: str, job_file: str, out: str) -> None:
     job = np.load(job_file)
     times, samples, imu = job["times"], job["samples"], bool(job["imu"])
@@ -72,18 +76,27 @@ def main(vocabulary: str, job_file: str, out: str) -> None:
                 Tbc=", ".join(f"{x:.9f}" for x in T_imu_camera.ravel()),
             )
         )  # fmt: skip
-    kind = pyorbslam3.Sensor.IMU_STEREO if imu else pyorbslam3.Sensor.STEREO
+    sensor = str(job["sensor"])
+    kind = {"stereo": "STEREO", "mono": "MONOCULAR", "rgbd": "RGBD"}[sensor]
+    kind = getattr(pyorbslam3.Sensor, f"IMU_{kind}" if imu else kind)
     slam = pyorbslam3.Slam(vocabulary, file.name, kind, use_viewer=False)
     live = np.full((len(times), 4, 4), np.nan)
     began, before = time.time(), times[0] - 1.0
     for k, t in enumerate(times):
-        left, right = (cv2.imread(str(job[side][k]), 0) for side in ("left", "right"))
+        left, right = (cv2.imread(str(job[side][k]), -1) for side in ("left", "right"))
         if job["dark"][k]:
             left, right = np.zeros_like(left), np.zeros_like(right)
         time.sleep(max(0.0, began + t - times[0] - time.time()))
         new = samples[(samples[:, 0] > before + 1e-6) & (samples[:, 0] <= t + 1e-6)]
         before = t
-        result = slam.track_stereo(left, right, t + 1.0, shifted(new) if imu else None)
+        rows = shifted(new) if imu else None
+        if sensor == "mono":
+            result = slam.track_monocular(left, t + 1.0, rows)
+        elif sensor == "rgbd":
+            metres = (right / CENTIMETRES).astype(np.float32)
+            result = slam.track_rgbd(left, metres, t + 1.0, rows)
+        else:
+            result = slam.track_stereo(left, right, t + 1.0, rows)
         if result.pose_valid:
             live[k] = result.pose_wc
     slam.shutdown()

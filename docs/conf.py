@@ -50,6 +50,7 @@ _PAGES = {
     "CONTRIBUTING.md": "about/contributing.md",
     "CHANGELOG.md": "about/changelog.md",
     "loopclosure/vocabulary.md": "explanation/vocabulary.md",
+    "backend/inertial.md": "explanation/inertial.md",
 }
 _LINK = re.compile(r"\[([^]]*)\]\((?!https?:|#|mailto:)([^)#\s]+)(#[^)\s]*)?\)")
 

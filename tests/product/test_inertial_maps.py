@@ -9,7 +9,6 @@ from test_inertia import CALIBRATION, CAMERA, LAST, TRUTH, samples, walk
 from vslam.config import Config
 from vslam.loopclosure.registry import create_detector
 from vslam.maps.storage import load_map
-from vslam.maps.stored_map import StoredMap
 from vslam.method.joining import join_maps
 from vslam.slam import Slam
 from vslam.types.geometry import inverse

@@ -16,7 +16,8 @@ GENERATED = ROOT / "docs" / "reference"  # commands.md and generated/, when the 
 DOCUMENTS = sorted(
     path
     for path in [
-        *ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "loopclosure").glob("*.md")
+        *ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"),
+        *(ROOT / "loopclosure").glob("*.md"), *(ROOT / "backend").glob("*.md"),
     ]
     if path.name != "commands.md" and GENERATED / "generated" not in path.parents
 )  # fmt: skip

@@ -28,7 +28,11 @@ from vslam.support.errors import InputError
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = [path for path in sorted(DOCS.rglob("*.md")) if path.name != "commands.md"]
-PAGES += [*sorted(ROOT.glob("*.md")), ROOT / "loopclosure" / "vocabulary.md"]
+PAGES += [
+    *sorted(ROOT.glob("*.md")),
+    ROOT / "loopclosure" / "vocabulary.md",
+    ROOT / "backend" / "inertial.md",
+]
 FENCE = re.compile(r"^```(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 SPAN = re.compile(r"`(vslam [^`\n]+)`")
 OF_PLUGINS = "thumbnail", "frames", "haze"  # the names in docs/howto/plugins.md

@@ -26,7 +26,7 @@ LOADS = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link"
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The site, which is built from a copy, because the build adds pages to docs/."""
     root = tmp_path_factory.mktemp("site")
-    for name in ("docs", "loopclosure", "tools"):
+    for name in ("docs", "backend", "loopclosure", "tools"):
         shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
     for path in ROOT.glob("*.md"):
         shutil.copy(path, root)

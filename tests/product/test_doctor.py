@@ -293,12 +293,30 @@ def test_depth_without_edges_says_nothing(depth_images):
 
 
 def test_one_camera_alone(clean):
-    alone = replace(clean, second=[None] * len(clean))
+    camera = clean.camera.left_camera()
+    alone = replace(clean, second=[None] * len(clean), camera=camera)
     found = {f.check for f in examine(alone, FEW).findings}
     assert found == {
         "images", "calibration", "features", "sharpness", "order of times", "frame rate", "gaps",
-        "jitter", "scale",
+        "jitter", "scale", "start",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("frames", "verdict", "measured"),
+    [
+        (slice(None), "good", "the map can begin with frames"),
+        ([0] * 8, "unknown", "no map begins in the first 8 frames: the camera hardly moves"),
+        (slice(0, 1), "unknown", "no map begins in the first 1 frame"),
+    ],
+)
+def test_whether_the_map_of_one_camera_can_begin(clean, frames, verdict, measured):
+    left = list(np.array(clean.left)[frames])
+    times = clean.timestamps[: len(left)]
+    alone = replace(clean, left=left, second=[None] * len(left), timestamps=times)
+    alone = replace(alone, camera=clean.camera.left_camera())
+    found = {f.check: f for f in examine(alone, FEW).findings}["start"]
+    assert (found.verdict, found.measured[: len(measured)]) == (verdict, measured)
 
 
 @pytest.mark.parametrize(

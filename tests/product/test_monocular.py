@@ -10,6 +10,7 @@ import pytest
 from ring import CAMERA, LAP, Oracle, Ring
 
 from vslam.evaluation.trajectories import evaluate_trajectory
+from vslam.run.slam_run import scale_warnings
 from vslam.slam import Slam
 from vslam.types.features import Extracted, Features, TrackingState
 from vslam.types.trajectory import Trajectory
@@ -134,6 +135,23 @@ def test_darkness_at_the_beginning_only_delays_it():
     assert all(r.state is TrackingState.LOST for r in results[:12])
     assert sum(r.state is TrackingState.LOST for r in results) < 20
     assert len(slam.trajectory()) == 40
+
+
+def test_a_start_that_no_motion_confirms_is_doubtful():
+    slam, _ = run(ROUND[:8])
+    assert not scale_warnings(slam.map)
+    poses = slam.map.arrays.T_cw[: slam.map.n_keyframes]
+    poses[1:, :3, 3] = 0.05 * poses[1:, :3, 3]
+    (said,) = scale_warnings(slam.map)
+    assert said.startswith("The start of the monocular map is doubtful")
+
+
+def test_a_scale_that_loops_have_changed_much_is_said():
+    slam, _ = run(ROUND[:30])
+    assert not scale_warnings(slam.map)
+    slam.map.unit_scale[-3:] *= 0.6
+    (said,) = scale_warnings(slam.map)
+    assert "by a factor of up to 1.7" in said
 
 
 @pytest.mark.slow

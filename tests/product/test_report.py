@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from vslam.config import Config, load_config
 from vslam.evaluation.loops import evaluate_loops
 from vslam.evaluation.trajectories import evaluate_trajectory, read_pair
+from vslam.method.gaps import Gap, GapKind
 from vslam.method.inertia import IMU_REFUSED
 from vslam.report.folder import write_results
 from vslam.report.run_page import headlines
@@ -738,6 +739,13 @@ def test_ground_truth_of_some_frames(tmp_path: Path) -> None:
         read_trajectory(tmp_path / name) for name in ("ground_truth.tum", "trajectory.tum")
     )
     assert evaluate_trajectory(estimate, truth).ate_rmse_m == pytest.approx(report.ate_rmse_m)
+
+
+def test_the_frames_with_a_scale_of_their_own_are_named(tmp_path: Path) -> None:
+    outcome = monocular(make_outcome(40, lost=slice(0, 0)))
+    gap = Gap(GapKind.PREDICTED, 20, 39, 0.5, 0.1, 2.0, 1.35)
+    report_of(replace(outcome, gaps=[gap]), tmp_path)
+    assert "frames 20 to 39 have scales of their own" in (tmp_path / "report.md").read_text()
 
 
 def test_frames_whose_poses_were_found_later_are_not_lost(tmp_path: Path) -> None:

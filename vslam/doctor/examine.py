@@ -19,6 +19,7 @@ from vslam.doctor import checks
 from vslam.doctor.findings import Finding, judge, sections
 from vslam.doctor.focal_length import Moved, fit_focal_length
 from vslam.doctor.imu import examine_imu
+from vslam.doctor.start import examine_start
 from vslam.frontend.extraction import find_corners
 from vslam.frontend.masks import Mask
 from vslam.report.page import Figure, Page, Section
@@ -105,7 +106,10 @@ def _examine_images(sequence: Source, config: Config) -> Diagnosis:
     findings += masked
     seconds = [second for _, second in read.values() if second is not None]
     if not seconds:
-        return Diagnosis([*findings, checks.check_scale(sequence.camera, None)], hidden)
+        findings.append(checks.check_scale(sequence.camera, None))
+        if lefts and sequence.camera.monocular:
+            findings.append(examine_start(sequence, config))
+        return Diagnosis(findings, hidden)
     if seconds[0].dtype == np.uint8:
         few_features = any(f.check == "features" and f.verdict == "fault" for f in findings)
         found, pictures = _examine_stereo(sequence, lefts, config, few_features=few_features)

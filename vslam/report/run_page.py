@@ -34,6 +34,7 @@ _ALIGNMENTS = {
     "none": "not aligned",
 }
 _MANY_LOST = 0.1  # as a share of the frames
+_MOST_STRETCHES = 3  # frames with a scale of their own
 _COMPARED = (
     ("lost", "lost_frames", "{}"),
     ("ATE", "ate_rmse_m", "{:.3f} m"),
@@ -58,7 +59,7 @@ _ABOUT_COMPARED = (
 def headlines(report: ReportJson) -> list[Tile]:
     """Create the summary of a run. Lost frames come first, because the ATE means little if many
     frames were lost."""
-    lost, mono = report.lost_frames, report.sensor == "mono"
+    lost = report.lost_frames
     share = f"{100.0 * lost / report.frames:.1f} % of" if lost else "of"
     alignment = _ALIGNMENTS[report.alignment] if report.alignment else ""
     spread = ""
@@ -78,7 +79,7 @@ def headlines(report: ReportJson) -> list[Tile]:
         ),
         *_in_map(report),
         *_on_earth(report),
-        *([Tile("Scale", "arbitrary", "unknown to a single camera")] if mono else []),
+        *_scale(report),
         Tile("ATE RMSE", _number(report.ate_rmse_m, "m"), evaluated),
         Tile("Causal ATE", _number(report.causal_ate_rmse_m, "m"), "poses at the time of tracking"),
         Tile("RPE", _number(report.rpe_m, "m"), f"per frame; rotation {rotation}"),
@@ -99,6 +100,18 @@ def headlines(report: ReportJson) -> list[Tile]:
         Tile("Map", f"{report.landmarks:,}", _map_note(report)),
         _loops(report),
     ]
+
+
+def _scale(report: ReportJson) -> list[Tile]:
+    if report.sensor != "mono" or report.metric_since_s is not None:
+        return []
+    own = [gap for gap in report.gaps if gap.scale != 1.0]
+    note = "unknown to a single camera"
+    if own:
+        stretches = ", ".join(f"{gap.first} to {gap.last}" for gap in own[:_MOST_STRETCHES])
+        more = ", ..." * (len(own) > _MOST_STRETCHES)
+        note += f"; frames {stretches}{more} have scales of their own"
+    return [Tile("Scale", "arbitrary", note)]
 
 
 def _carried(report: ReportJson) -> str:

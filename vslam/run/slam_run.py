@@ -31,12 +31,18 @@ from vslam.support.machine import peak_memory_mb, process_age
 from vslam.support.plugins import reason
 from vslam.types.camera import Camera
 from vslam.types.features import TrackingState, TrackResult
-from vslam.types.geometry import Matrix
+from vslam.types.geometry import Matrix, inverses
 from vslam.types.loops import LoopCorrection, LoopEdge
 from vslam.types.map import Map
+from vslam.types.map_kernels import gather_observations
 from vslam.types.trajectory import Trajectory
 
 _log = logging.getLogger(__name__)
+
+# The start of a monocular map is doubtful if the parallax of its first scene stays below this
+# angle, in degrees, with which a map begins. [own]
+_DOUBTFUL_PARALLAX_DEG = 1.0
+_LARGE_CHANGE = 1.5  # factor by which loops change the scale of a monocular map [own]
 
 
 class SlamRun:
@@ -222,6 +228,7 @@ class SlamRun:
                 *slam.problems,
                 *rig_warnings(slam.rig.sides),
                 *_map_warnings(slam, source.camera),
+                *_scale_warnings(slam, source.camera),
                 *mistracked_warnings(loops, keyframe_frames),
             ],
             n_keyframes=len(slam.map.living_keyframes()),
@@ -348,6 +355,52 @@ def _map_warnings(slam: Slam, camera: Camera) -> list[str]:
         return offset_warnings(measure_offset(slam.map, camera), camera)
     except Exception as error:  # a failed check must not end the run
         return [f"The rig could not be checked ({reason(error)})."]
+
+
+def _scale_warnings(slam: Slam, camera: Camera) -> list[str]:
+    if not camera.monocular or slam.metric_since is not None or not slam.map.n_keyframes:
+        return []
+    return scale_warnings(slam.map)
+
+
+def scale_warnings(map_: Map) -> list[str]:
+    """Warn if the start or the scale of a monocular map is doubtful.
+
+    The start is doubtful if the landmarks that its first keyframe sees were never seen from
+    another direction, and the scale if loops have changed it much along the path.
+    """
+    said = []
+    parallax = _largest_parallax(map_)
+    if parallax < _DOUBTFUL_PARALLAX_DEG:
+        said.append(
+            f"The start of the monocular map is doubtful: what its first keyframe sees was never "
+            f"seen from a direction that differs by more than {parallax:.1f} degrees. The depths "
+            "may be wrong, and the scale of the first poses with them."
+        )
+    units = map_.unit_scale[map_.living_keyframes()]
+    change = float(units.max() / units.min())
+    if change > _LARGE_CHANGE:
+        said.append(
+            f"The scale of the monocular map drifted: loops have corrected it by a factor of up to "
+            f"{change:.1f} between parts of the path. Lengths between the loops are less certain."
+        )
+    return said
+
+
+def _largest_parallax(map_: Map) -> float:
+    """Return the median angle, in degrees, between the rays from the first keyframe and from the
+    keyframe of the most different direction, over the landmarks that the first keyframe sees."""
+    ids = map_.landmarks_of(0)
+    first, rows = gather_observations(map_.arrays, ids, np.arange(map_.n_keyframes))
+    centres = inverses(map_.arrays.T_cw[: map_.n_keyframes])[:, :3, 3]
+    xyz, seen_by = map_.arrays.xyz[ids], map_.arrays.keyframe[rows]
+    point = np.repeat(np.arange(len(ids)), np.diff(first))
+    rays, ray_0 = xyz[point] - centres[seen_by], xyz - centres[0]
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    ray_0 /= np.linalg.norm(ray_0, axis=1)[:, None]
+    cosine = np.ones(len(ids))
+    np.minimum.at(cosine, point, np.einsum("ni,ni->n", rays, ray_0[point]))
+    return float(np.degrees(np.arccos(np.clip(np.median(cosine), -1.0, 1.0)))) if len(ids) else 0.0
 
 
 def mistracked_warnings(loops: list[LoopEdge], frames: NDArray[np.int64]) -> list[str]:

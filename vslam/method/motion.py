@@ -55,6 +55,9 @@ from vslam.types.odometry import OdometryState, at_keyframe, moved
 from vslam.types.states import MotionState
 from vslam.types.track import By, Standstill, Track
 
+# A pose that turned by so much more or less than the gyroscope is wrong, in rad. [own]
+WRONG_TURN = 0.01
+
 
 class Motion:
     """Predicts the pose of each frame, and follows the camera from frame to frame.
@@ -273,11 +276,20 @@ class Motion:
         self, track: Track, predicted: Prediction, odometry: OdometryState, inertia: Inertia
     ) -> tuple[Track, OdometryState]:
         """Return a tracked frame and the odometry at the pose that images and samples give
-        together, weighed by their covariances."""
+        together, weighed by their covariances.
+
+        If the filter has refused the pose of the images, it is used nevertheless, because the state
+        may be wrong, unless the camera turned in another way: a gyroscope errs little in so short a
+        time. The pose that the samples predict is then used.
+        """
         state = inertia.state
-        if self._imu is None or predicted.inertial is None or state is None or inertia.refused:
+        if self._imu is None or predicted.inertial is None or state is None:
             return track, odometry
         T_odom_fused = camera_pose(state, self._imu.T_imu_camera)
+        if inertia.refused:
+            turned = T_odom_fused[:3, :3].T @ odometry.T_odom_camera[:3, :3]
+            if not np.trace(turned) < 1.0 + 2.0 * np.cos(WRONG_TURN):
+                return track, odometry
         T_fused_seen = self._as_tracked(inverse(T_odom_fused) @ odometry.T_odom_camera)
         track = replace(track, T_cw=orthonormalised(T_fused_seen @ track.T_cw))
         return track, replace(odometry, T_odom_camera=T_odom_fused)

@@ -102,7 +102,8 @@ def presets() -> list[str]:
     lines = [
         "## Presets\n",
         "A preset sets several thresholds. All others keep their defaults. The preset `fast` "
-        "trades accuracy for speed ([measurements](../research/performance.md#the-preset-fast)).\n",
+        "trades accuracy for speed ([measurements](../research/performance.md#the-preset-fast)), "
+        "and `accurate` speed for accuracy ([measurements](../howto/offline.md)).\n",
         "| preset | thresholds |",
         "|---|---|",
     ]

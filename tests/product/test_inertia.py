@@ -18,6 +18,7 @@ from vslam.method.inertia import (
     KEPT_S,
     gravity_direction,
     lost,
+    moves,
     predicted_state,
     tracked,
     with_samples,
@@ -26,7 +27,7 @@ from vslam.slam import Slam
 from vslam.types.camera import Camera
 from vslam.types.features import TrackingState
 from vslam.types.geometry import inverse, se3_exp, se3_log
-from vslam.types.imu import GRAVITY, ImuCalibration, Inertia
+from vslam.types.imu import GRAVITY, ImuCalibration, Inertia, InertialState
 
 CAMERA = Camera(240.0, 240.0, 239.5, 79.5, 0.3, 480, 160)
 T_IMU_CAMERA = se3_exp(np.array([0.05, -0.02, 0.1, 0.2, 1.0, -1.5]))
@@ -361,6 +362,16 @@ def test_what_is_seen_first_after_the_dark_joins_the_map_only_with_an_imu(imu):
     assert slam.in_map()[-1]
     assert results[-1].part == 0
     assert error(results[-1])[0] < 0.1
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.2])
+def test_a_slow_flight_is_known_to_move(speed):
+    """0.2 m/s are 0.2 px a frame for a camera 20 m above the ground."""
+    state = InertialState(
+        0.0, np.eye(4), np.array([speed, 0.0, 0.0]), DOWN, np.zeros(6), 0.02**2 * np.eye(18)
+    )
+    assert moves(state) == (speed > 0.0)
+    assert not moves(None)
 
 
 @pytest.mark.parametrize("acceleration", [0.0, 0.5])

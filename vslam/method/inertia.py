@@ -74,12 +74,14 @@ SIGMA_PX, SCALE_SIGMA_RAD = 0.15, 0.0005
 POSE_INFLATION = 4.0
 SIGMA_M, SIGMA_RAD = 0.001, 0.0002
 SIGMA_PER_M = 0.005  # share of the distance between two frames, if that is larger, at the start
-# Factor of the noise of the samples in bundle adjustment, where the filter tells gravity and the
-# biases, which it has learned from the same images, and beside poses that it has improved. With 1,
-# some straight paths get 0.3 % too long, and with 10, the samples improve little. [own]
-BUNDLES = 3.0
+# Factor of the noise of the samples in bundle adjustment, and beside poses that it has improved.
+# With 1, some straight paths get 0.3 % too long, and with 10, the samples improve little. Gravity
+# and the biases of the filter come from the same images, so their covariance is multiplied by
+# BUNDLE_PRIOR there. With 1, a straight path gets 0.23 % too long, and with 10, 0.01 %. [own]
+BUNDLES, BUNDLE_PRIOR = 3.0, 10.0
 _TURN_AND_FALL = np.ix_(*[np.r_[TURN, FALL]] * 2)
 REST_SIGMA = 0.01  # m/s, standard deviation of the velocity of a camera that stands still
+MOVES = 16.3  # chi-square of three degrees of freedom, 0.001
 # A camera that stood still has moved off if the samples of a frame show more than this, in m/s^2
 # and rad/s. A car gains 1 m/s^2.
 REST_ACCEL, REST_RATE = 0.1, 0.02
@@ -250,6 +252,15 @@ def lost(
     if stood_still and _rests(before, predicted):
         return replace(inertia, state=corrected_by_rest(predicted, REST_SIGMA).state)
     return replace(inertia, state=predicted, carried_s=inertia.carried_s + seconds)
+
+
+def moves(state: InertialState | None) -> bool:
+    """Return whether it is certain that the camera moves. A slow flight high above the ground moves
+    landmarks as little in the image as rest does."""
+    if state is None:
+        return False
+    P = state.covariance[SPEED, SPEED] + REST_SIGMA**2 * np.eye(3)
+    return float(state.velocity @ np.linalg.solve(P, state.velocity)) > MOVES
 
 
 def _rests(before: InertialState, after: InertialState) -> bool:

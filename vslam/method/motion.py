@@ -16,6 +16,7 @@ from vslam.frontend.standstill import has_come_to_rest, is_small
 from vslam.frontend.tracking import uncertainty_of
 from vslam.method.gyro import turn_by_gyro, turn_of_start, with_turn
 from vslam.method.inertia import (
+    BUNDLE_PRIOR,
     CARRIED_S,
     KEPT_S,
     KEPT_WITHOUT_SCALE_S,
@@ -27,6 +28,7 @@ from vslam.method.inertia import (
     in_metres,
     is_refused,
     lost,
+    moves,
     noise_for_bundles,
     predicted_covariance,
     predicted_motion,
@@ -314,6 +316,7 @@ class Motion:
             T = camera.T_mounted_camera
             R_odom_camera, T_imu_camera = R_odom_camera @ T[:3, :3], T_imu_camera @ T
         samples, noise = self.state.inertia.samples, noise_for_bundles(self.state.inertia, imu)
+        state = replace(state, covariance=BUNDLE_PRIOR * state.covariance)
         return InertialWindow(samples, state, R_odom_camera, T_imu_camera, noise, LONGEST_GAP)
 
     def turn_between(self, start: float, end: float) -> KnownTurn | None:
@@ -396,6 +399,8 @@ class Motion:
         """Return the standstill that begins with a frame, or None if the camera moves."""
         last = predicted.last
         if last is None or not track.by_patches or not predicted.is_tracking:
+            return None
+        if moves(predicted.inertial):
             return None
         before, now = np.flatnonzero(last.landmark >= 0), np.flatnonzero(track.landmark >= 0)
         ids, first = np.unique(last.landmark[before], return_index=True)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 import pytest
 
-from tests.inertial import ADIS16448, DOWN, Flight
+from tests.inertial import ADIS16448, DOWN, EUROC, Flight, Recording, recording
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
 from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.inertial_adjustment import (
@@ -19,6 +19,7 @@ from vslam.backend.inertial_adjustment import (
     start_values,
 )
 from vslam.backend.inertial_factor import InertialLinks, Motions, inertial_factor
+from vslam.backend.inertial_filter import noise_in_motion
 from vslam.backend.inertial_links import GRAVITY_SIGMA
 from vslam.backend.inertial_start import ACCEL_BIAS, GYRO_BIAS
 from vslam.backend.keyframe_motions import motions_between, record_motion
@@ -38,7 +39,18 @@ FLIGHT = Flight(seed=3)
 SIGMAS = np.repeat([0.0, 0.0, 0.0, 0.05, 0.01, 0.1], 3)  # of the filter's state
 
 
-def camera_at(t: float, flight: Flight = FLIGHT) -> np.ndarray:
+@dataclass(frozen=True)
+class Shifted:
+    """A recording that begins later."""
+
+    recording: Recording
+    start: float
+
+    def pose(self, t: float) -> np.ndarray:
+        return self.recording.pose(self.start + t)
+
+
+def camera_at(t: float, flight: Flight | Shifted = FLIGHT) -> np.ndarray:
     """Return ``T_cw`` of the camera of the flight."""
     return inverse(flight.pose(t) @ T_IC)
 
@@ -112,7 +124,7 @@ def test_the_cost_is_gtsams():
 
 
 def scene(
-    seed: int, n: int = 8, step: float = 0.3, sigma: float = 1.0, flight: Flight = FLIGHT
+    seed: int, n: int = 8, step: float = 0.3, sigma: float = 1.0, flight: Flight | Shifted = FLIGHT
 ) -> tuple[BundleProblem, np.ndarray, np.ndarray]:
     """Make a bundle problem of a few points far away. The first keyframe is held fixed.
 
@@ -331,3 +343,25 @@ def test_global_bundle_adjustment_does_not_use_samples_that_contradict_the_image
     solution = adjust_globally(together, iterations=20)
     level = adjust_globally(replace(together, links=None), iterations=20)
     assert solution.T_cw.tobytes() == level.T_cw.tobytes()
+
+
+@pytest.mark.skipif(not EUROC.is_dir(), reason="EuRoC's inertial data absent")
+@pytest.mark.parametrize("fault", ["none", "late", "stretched"])
+def test_real_samples_agree_with_images_and_wrong_ones_do_not(fault):
+    """The samples of a fast flight, with simulated observations along its true poses."""
+    flight, agreed = recording("V1_03"), []
+    moving = flight.times[np.linalg.norm(flight.velocity, axis=1) > 0.3]
+    for start in np.linspace(moving[0] + 1.0, moving[-1] - 6.0, 6):
+        poses = Shifted(flight, start)
+        problem, _, times = scene(int(start), sigma=0.4, flight=poses)
+        rows = flight.samples - np.r_[start, np.zeros(6)]
+        rows = rows[np.abs(rows[:, 0]) < 5.0]
+        if fault == "late":
+            rows[:, 0] += 0.015
+        if fault == "stretched":
+            rows[:, 1:] *= 1.05
+        bias = flight.bias[np.searchsorted(flight.times, start)]
+        noise = noise_in_motion(ADIS16448, rows[rows[:, 0] < 2.0])
+        made = chain(problem, times, window(rows, noise=noise, bias=bias))
+        agreed.append(adjust_with_imu(problem, made, iterations=30) is not None)
+    assert all(agreed) if fault == "none" else not any(agreed)

@@ -102,8 +102,7 @@ def presets() -> list[str]:
     lines = [
         "## Presets\n",
         "A preset sets several thresholds. All others keep their defaults. The preset `fast` "
-        "trades accuracy for speed ([measurements](../research/performance.md#the-preset-fast)), "
-        "and `accurate` speed for accuracy ([measurements](../howto/offline.md)).\n",
+        "trades accuracy for speed ([measurements](../research/performance.md#the-preset-fast)).\n",
         "| preset | thresholds |",
         "|---|---|",
     ]

@@ -469,11 +469,10 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "keyframes.patch_kept_close": 0.3,
         "keyframes.publish_after_frames": 3,
         "mapping.neighbours": 5,
-    },
-    "accurate": {"keyframes.patch_kept_close": 0.8},
+    }
 }
 """Thresholds by the name of the preset, and by dotted name. ``fast`` trades accuracy for speed
-(docs/research/performance.md), and ``accurate`` speed for accuracy (docs/howto/offline.md)."""
+(docs/research/performance.md)."""
 
 
 def load_config(path: Path | str) -> Config:

@@ -28,8 +28,7 @@ THRESHOLDS = Option(
     METHOD,
     "FILE|NAME=VALUE",
     "Thresholds: a JSON file, or values separated by commas, such as orb.n_features=1000 "
-    "(docs/reference/thresholds.md). [b]fast[/b] is faster but less accurate, [b]accurate[/b] is "
-    "slower but more accurate (stereo).",
+    "(docs/reference/thresholds.md). [b]fast[/b] is faster but less accurate.",
     name="--config",
     given_as=str,
 )

@@ -75,7 +75,7 @@ POSE_INFLATION = 4.0
 SIGMA_M, SIGMA_RAD = 0.001, 0.0002
 SIGMA_PER_M = 0.005  # share of the distance between two frames, if that is larger, at the start
 # Factor of the noise of the samples in bundle adjustment, and beside poses that it has improved.
-# With 1, some straight paths get 0.3 % too long, and with 10, the samples improve little. Gravity
+# With 1, a straight path gets 0.3 % too long, and with 10, the samples improve little. Gravity
 # and the biases of the filter come from the same images, so their covariance is multiplied by
 # BUNDLE_PRIOR there. With 1, a straight path gets 0.23 % too long, and with 10, 0.01 %. [own]
 BUNDLES, BUNDLE_PRIOR = 3.0, 10.0

@@ -151,3 +151,24 @@ def test_auto_calibrates_one_recorded_camera(clip, call):
         code, _, err = call("run", clip, "--calib", "auto", *options)
         assert code == 2
         assert what in err
+
+
+def test_exif_tells_the_focal_length_where_the_motion_does_not(tmp_path, call):
+    from PIL import Image
+
+    (tmp_path / "still").mkdir()
+    noise = np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8)
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 28  # mm, equivalent for a diagonal of 43.27 mm
+    for k in range(4):
+        Image.fromarray(noise).save(tmp_path / "still" / f"{k}.jpg", exif=exif)
+    words = ("calibrate", "still", "--fps", "10", "--auto", "--out", "camera.yaml")
+    code, out, _ = call(*words)
+    assert code == 0
+    assert "from EXIF" in out
+    assert read_calibration([tmp_path / "camera.yaml"]).left.fx == pytest.approx(51.77, abs=0.01)
+    for file in (tmp_path / "still").iterdir():
+        Image.fromarray(noise).save(file)
+    code, _, err = call(*words)
+    assert code == 2
+    assert "still: --calib auto: corners cannot be followed" in err

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.calibration.models import Array, CameraModel, Lens, unproject
+from vslam.calibration.models import Array, CameraModel, Lens, unproject, without_zeros
 
 UNKNOWNS = 6
 LOG_FOCAL, CENTRE, READ_OUT = 0, slice(3, 5), 5
@@ -63,8 +63,9 @@ class Corners:
     late: Array
     noise: float
 
-    def of(self, chains: NDArray[Any]) -> Corners:
-        return replace(self, xy=self.xy[chains], late=self.late[chains])
+    def of(self, chains: NDArray[Any], every: int = 1) -> Corners:
+        """Return some of the chains, with every n-th corner."""
+        return replace(self, xy=self.xy[chains, :, ::every], late=self.late[chains, :, ::every])
 
 
 @dataclass(frozen=True)
@@ -112,8 +113,9 @@ def begin(camera: CameraModel, corners: Corners) -> Scenes:
     C, K, N, _ = corners.xy.shape
     R, t = np.tile(np.eye(3), (C, K, 1, 1)), np.zeros((C, K, 3))
     points = np.full((C, N, 3), np.nan)
+    model = replace(camera, distortion=without_zeros(camera.lens, camera.distortion))
     for c, xy in enumerate(corners.xy):
-        rays = unproject(camera, xy[[0, -1]].reshape(-1, 2)).reshape(2, N, 3)
+        rays = unproject(model, xy[[0, -1]].reshape(-1, 2)).reshape(2, N, 3)
         with np.errstate(invalid="ignore"):
             rays[~(rays[..., 2] > _NEAREST_Z)] = np.nan
         plane = rays / rays[..., 2:]
@@ -216,7 +218,7 @@ class _State:
         self.prior = np.r_[0.0, (_USUAL * corners.noise) ** 2 / sigma**2]
         points = scenes.points
         one = np.concatenate([points[..., :2], np.ones((*points.shape[:2], 1))], axis=-1)
-        self.turned = np.einsum("ckij,cnj->ckni", scenes.R, one)
+        self.turned = one[:, None] @ scenes.R.swapaxes(2, 3)
         self.seen_at = self.turned + points[:, None, :, 2:] * scenes.t[:, :, None]
         self.ratio, self.ratio_by_point, self.ratio_by_k = _ratio(
             camera.lens, camera.distortion, self.seen_at
@@ -247,7 +249,7 @@ class _Equations:
         by_point = _where(w, camera.fx * by_point)  # (C, K, N, 2, 3)
         R, t, rho = state.scenes.R, state.scenes.t, state.scenes.points[..., 2]
         directions = np.stack([R[..., 0], R[..., 1], t], axis=-1)  # (C, K, 3, 3)
-        J_point = _where(w, np.einsum("cknij,ckjl->cknil", by_point, directions))
+        J_point = _where(w, by_point @ directions[:, :, None])
         turning = np.cross(state.turned[..., None, :], by_point)
         J_pose = np.concatenate([turning, by_point * rho[:, None, :, None, None]], axis=-1)
         J_pose = _where(w, J_pose)[:, 1:]
@@ -264,33 +266,30 @@ class _Equations:
         J_camera[..., 0, 3] = J_camera[..., 1, 4] = 1.0
         J_camera[..., READ_OUT] = state.corners.late
         J_camera = _where(w, J_camera)
-        wJ_point = w[..., None, None] * J_point
-        wJ_pose, wJ_camera = w[:, 1:, :, None, None] * J_pose, w[..., None, None] * J_camera
-        self._points = np.einsum("cknia,cknib->cnab", wJ_point, J_point)
-        self._b_points = np.einsum("cknia,ckni->cna", wJ_point, e)
+        root = np.sqrt(w)[..., None]
+        J_point, J_pose = root[..., None] * J_point, root[:, 1:, :, :, None] * J_pose
+        J_camera, e = root[..., None] * J_camera, root * e
+        by_corner = J_point.transpose(0, 2, 4, 1, 3).reshape(C, N, 3, 2 * K)
+        self._points = by_corner @ by_corner.swapaxes(2, 3)
+        self._b_points = (by_corner @ e.swapaxes(1, 2).reshape(C, N, 2 * K, 1))[..., 0]
         self._n = n = 6 * (K - 1)
-        poses = np.einsum("cknia,cknib->ckab", wJ_pose, J_pose)
-        mixed = np.einsum("cknia,cknib->ckab", wJ_pose, J_camera[:, 1:]).reshape(C, n, UNKNOWNS)
+        by_pose = J_pose.reshape(C, K - 1, 2 * N, 6).swapaxes(2, 3)
+        by_camera = J_camera.reshape(C, K, 2 * N, UNKNOWNS)
+        poses = by_pose @ by_pose.swapaxes(2, 3)
+        mixed = (by_pose @ by_camera[:, 1:]).reshape(C, n, UNKNOWNS)
         self._rest = np.zeros((C, n + UNKNOWNS, n + UNKNOWNS))
         for k in range(K - 1):
             at = slice(6 * k, 6 * k + 6)
             self._rest[:, at, at] = poses[:, k]
         self._rest[:, :n, n:], self._rest[:, n:, :n] = mixed, mixed.swapaxes(1, 2)
-        self._rest[:, n:, n:] = np.einsum("cknia,cknib->cab", wJ_camera, J_camera)
-        self._b_rest = np.concatenate(
-            [
-                np.einsum("cknia,ckni->cka", wJ_pose, e[:, 1:]).reshape(C, n),
-                np.einsum("cknia,ckni->ca", wJ_camera, e),
-            ],
-            axis=1,
-        )
-        self._coupling = np.concatenate(
-            [
-                np.einsum("cknia,cknib->ckanb", wJ_pose, J_point[:, 1:]).reshape(C, n, N, 3),
-                np.einsum("cknia,cknib->canb", wJ_camera, J_point),
-            ],
-            axis=1,
-        )
+        flat = by_camera.reshape(C, -1, UNKNOWNS).swapaxes(1, 2)
+        self._rest[:, n:, n:] = flat @ flat.swapaxes(1, 2)
+        of_poses = by_pose @ e[:, 1:].reshape(C, K - 1, 2 * N, 1)
+        of_camera = flat @ e.reshape(C, -1, 1)
+        self._b_rest = np.concatenate([of_poses.reshape(C, n), of_camera[..., 0]], axis=1)
+        couple = _products(J_pose, J_point[:, 1:]).transpose(0, 1, 3, 2, 4).reshape(C, n, N, 3)
+        camera_point = _products(J_camera, J_point).sum(axis=1).swapaxes(1, 2)
+        self._coupling = np.concatenate([couple, camera_point], axis=1)
 
     def _eliminated(self, damping: float) -> tuple[Array, Array, Array, Array]:
         """Eliminate points and poses.
@@ -303,9 +302,11 @@ class _Equations:
         n, eye = self._n, np.eye(3)
         diagonal = damping * np.einsum("cnaa->cna", self._points)[..., None]
         inverses = np.linalg.inv(self._points + (diagonal + 1e-9) * eye)
-        weighted = np.einsum("canb,cnbd->cand", self._coupling, inverses)
-        A = self._rest - np.einsum("cand,cbnd->cab", weighted, self._coupling)
-        b = self._b_rest - np.einsum("cand,cnd->ca", weighted, self._b_points)
+        C, m = self._b_rest.shape
+        coupling = self._coupling.reshape(C, m, -1)
+        weighted = (self._coupling.swapaxes(1, 2) @ inverses).swapaxes(1, 2).reshape(C, m, -1)
+        A = self._rest - weighted @ coupling.swapaxes(1, 2)
+        b = self._b_rest - (weighted @ self._b_points.reshape(C, -1, 1))[..., 0]
         added = damping * np.einsum("caa->ca", self._rest)[:, :n] + 1e-9
         right = np.concatenate([A[:, :n, n:], b[:, :n, None]], axis=2)
         X = np.linalg.solve(A[:, :n, :n] + added[..., None] * np.eye(n), right)
@@ -331,7 +332,8 @@ class _Equations:
             move[LOG_FOCAL] = np.clip(move[LOG_FOCAL], -_LONGEST_STEP, _LONGEST_STEP)
         poses = X[..., UNKNOWNS] - X[..., :UNKNOWNS] @ move
         rest = np.concatenate([poses, np.tile(move, (C, 1))], axis=1)
-        left = self._b_points - np.einsum("cand,ca->cnd", self._coupling, rest)
+        coupling = self._coupling.reshape(C, rest.shape[1], -1).swapaxes(1, 2)
+        left = self._b_points - (coupling @ rest[..., None]).reshape(self._b_points.shape)
         points = np.einsum("cnab,cnb->cna", inverses, left)
         camera, growth = state.camera, float(np.exp(move[LOG_FOCAL]))
         focal, k = camera.fx * growth, (state.radial + move[1:3]) / state.powers
@@ -348,6 +350,12 @@ class _Equations:
         return _State(
             moved, state.read_out + float(move[READ_OUT]), scenes, state.corners, state.turning
         )
+
+
+def _products(one: Array, two: Array) -> Array:
+    """Multiply the transposed ``(..., 2, a)`` matrices with the ``(..., 2, b)`` matrices."""
+    first = one[..., 0, :, None] * two[..., 0, None, :]
+    return np.asarray(first + one[..., 1, :, None] * two[..., 1, None, :])
 
 
 def _where(weights: Array, J: Array) -> Array:

@@ -29,7 +29,7 @@ from vslam.calibration.models import Array, CameraModel, Lens, unproject
 from vslam.support.errors import InputError
 from vslam.types.camera import Image
 
-_MOST_CHAINS, _SCANNED = 24, 10  # chains that are adjusted, and chains with which views are scanned
+_MOST_CHAINS, _SCANNED = 24, 8  # chains that are adjusted, and chains with which views are scanned
 _MOST_POINTS = 160  # of a chain
 _SCAN_ITERATIONS, _ITERATIONS, _CHECK_ITERATIONS = 4, 40, 20
 # Fields of view along the longer side that are tried, in degrees. Neighbours differ by 10 to 30 %
@@ -48,6 +48,8 @@ _OTHER, _LEAST_RISE = 0.2, 0.25
 _MOST_MINIMA, _BETTER = 3, 1e-3  # local minima that are left, and the least reduction of the cost
 _LEAST_KNOWN = 0.03  # largest standard deviation of the focal length, relative [own]
 _FEWEST_FOR_ZOOM = 6  # chains
+_STATED = " (from EXIF, because the motion does not tell it)"
+_STATED_SIGMA = 0.05  # of a focal length in EXIF: rounded to millimetres, and images are cropped
 _ZOOM, _ZOOM_SIGMAS = 0.05, 4.0  # relative change of the focal length that is a zoom [own]
 _ROLLING = 0.15  # read-out time in frame intervals that is a rolling shutter [own]
 
@@ -62,7 +64,8 @@ class MotionFit:
         view: horizontal field of view in degrees.
         read_out: time between the exposure of the first and of the last row, in intervals between
             frames. 0 for a global shutter.
-        chains: number of chains of keyframes.
+        chains: number of chains of keyframes. 0 if the images state the focal length, because their
+            motion does not determine it.
         zoomed: relative change of the focal length from the first half to the second half of the
             images; 0 if it is not significant.
     """
@@ -78,7 +81,7 @@ class MotionFit:
         fisheye = ", fisheye lens" if self.camera.lens == "fisheye" else ""
         return (
             f"focal length {self.camera.fx:.1f} px, standard deviation {100 * self.sigma:.1f} %, "
-            f"field of view {self.view:.0f} degrees{fisheye}"
+            f"field of view {self.view:.0f} degrees{fisheye}{'' if self.chains else _STATED}"
         )
 
     def warnings(self) -> list[str]:
@@ -97,7 +100,10 @@ class MotionFit:
 
 
 def camera_from_motion(
-    images: Iterable[tuple[float, Image]], size: tuple[int, int], source: str
+    images: Iterable[tuple[float, Image]],
+    size: tuple[int, int],
+    source: str,
+    stated: float | None = None,
 ) -> MotionFit:
     """Estimate a camera from the images of a moving camera. The same images give the same camera.
 
@@ -105,11 +111,20 @@ def camera_from_motion(
         images: time in seconds and ``(H, W)`` uint8 image of each frame.
         size: width and height of the images.
         source: name of the images, for error messages.
+        stated: focal length in pixels that the images state, which is used if their motion does not
+            determine it. None if they state none.
 
     Raises:
         InputError: the motion does not determine the focal length.
     """
-    return camera_from_chains(list(chains_of(images)), size, source)
+    try:
+        return camera_from_chains(list(chains_of(images)), size, source)
+    except InputError:
+        if stated is None:
+            raise
+    centre = round((size[0] - 1) / 2.0, 3), round((size[1] - 1) / 2.0, 3)
+    camera = CameraModel(stated, stated, *centre, *size)
+    return MotionFit(camera, _STATED_SIGMA, _view(camera), 0.0, 0)
 
 
 def camera_from_chains(chains: Sequence[Chain], size: tuple[int, int], source: str) -> MotionFit:
@@ -183,7 +198,7 @@ class _Fit:
 
 
 def _best_fit(corners: Corners, size: tuple[int, int]) -> _Fit:
-    few = corners.of(np.array(_spread(len(corners.xy), _SCANNED)))
+    few = corners.of(np.array(_spread(len(corners.xy), _SCANNED)), every=2)
     fits: list[_Fit] = []
     for lens, views in _VIEWS.items():
         tried = [

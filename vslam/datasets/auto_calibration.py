@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 
+import numpy as np
+
 from vslam.calibration.from_motion import MotionFit, camera_from_motion
-from vslam.datasets.frames import RawSource
+from vslam.datasets.frames import RawSource, Size
 from vslam.support.errors import BrokenSourceError, InputError, UnreadableImageError
 from vslam.types.camera import Image
 from vslam.types.source_options import SourceOptions
@@ -14,6 +16,7 @@ from vslam.types.source_options import SourceOptions
 SECONDS = 60.0
 """Length of the beginning of a recording that is used."""
 
+_EXIF, _FOCAL_LENGTH_35_MM = 0x8769, 0xA405  # tags of EXIF 2.32
 _CALIBRATED = ("images", "video", "bag")
 
 
@@ -55,7 +58,23 @@ def calibrate_source(raw: RawSource, data: str) -> MotionFit:
     Raises:
         InputError: the motion does not determine the focal length.
     """
-    return camera_from_motion(_images(raw), raw.sizes[0], f"{data}: --calib auto")
+    size, name = raw.sizes[0], f"{data}: --calib auto"
+    return camera_from_motion(_images(raw), size, name, _stated_focal_length(raw, size))
+
+
+def _stated_focal_length(raw: RawSource, size: Size) -> float | None:
+    """Return the focal length in pixels that EXIF states for the first image, as the equivalent for
+    a film of 36x24 mm with the same diagonal (CIPA DCG-001). None if there is none."""
+    file = raw.stored[0].file if raw.stored else None
+    if file is None:
+        return None
+    from PIL import Image as PillowImage
+
+    with suppress(Exception), PillowImage.open(file) as image:  # many kinds of errors
+        equivalent = float(image.getexif().get_ifd(_EXIF).get(_FOCAL_LENGTH_35_MM, 0))
+        focal = equivalent / float(np.hypot(36.0, 24.0)) * float(np.hypot(*size))
+        return round(focal, 3) if 0.0 < focal < float("inf") else None
+    return None
 
 
 def _images(raw: RawSource) -> Iterator[tuple[float, Image]]:

@@ -22,6 +22,7 @@ from vslam_lab.towns.passes import Passes
 from vslam_lab.towns.render import Renderer, sensor_image
 from vslam_lab.towns.rooms import build_room
 
+STREET = Path(__file__).parents[3] / "shared/data/kitti/sequences/00/image_0"
 SIZE = (640, 480)
 PINHOLE = CameraModel(430.0, 430.0, 319.5, 239.5, *SIZE, "pinhole", (-0.12, 0.03, 0.0, 0.0))
 FISHEYE = CameraModel(250.0, 250.0, 319.5, 239.5, *SIZE, "fisheye", (0.02, -0.01, 0.0, 0.0))
@@ -140,6 +141,30 @@ def test_from_a_video_to_a_splat_in_two_commands_without_a_calibration(clip, tmp
     assert code == 0
     assert "standard deviation" in out
     assert read_calibration([tmp_path / "camera.yaml"]).left == model  # the same images
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not STREET.is_dir(), reason="KITTI sample absent")
+def test_a_real_drive_whose_calibration_is_withheld(tmp_path, call):
+    options = (
+        "--calib",
+        "auto",
+        "--start",
+        100,
+        "--max-frames",
+        120,
+        "--fps",
+        10,
+        "--no-record",
+        "--no-report",
+    )
+    code, _, err = call("run", STREET, *options, "--out", "runs", "--threads", 1)
+    assert code == 0, err
+    model = read_calibration([tmp_path / "runs" / "latest" / "calibration.yaml"]).left
+    assert model.fx == pytest.approx(718.856, rel=0.04)
+    assert call("export", "nerfstudio", "runs/latest")[0] == 0
+    scene = json.loads((tmp_path / "runs" / "latest" / "nerfstudio/transforms.json").read_text())
+    assert len(scene["frames"]) > 10
 
 
 def test_auto_calibrates_one_recorded_camera(clip, call):

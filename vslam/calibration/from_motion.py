@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri, stdtrit
 
 from vslam.calibration.chain_adjustment import (
     LOG_FOCAL,
@@ -38,6 +39,7 @@ _VIEWS: dict[Lens, tuple[float, ...]] = {
     "pinhole": tuple(np.geomspace(20.0, 125.0, 13).tolist()),
     "fisheye": tuple(np.geomspace(90.0, 200.0, 6).tolist()),
 }
+_WIDE = 80.0  # degrees; narrower lenses are no fisheye lenses
 _WIDER = 0.9  # ratio of the costs below which a fisheye lens is preferred to a pinhole camera [own]
 # Ratio of the costs below which the camera turns on the spot. Without parallax, depths reduce the
 # cost by a ninth. [own]
@@ -46,7 +48,11 @@ _NO_PARALLAX = 1.2
 # standard deviation predicts. [own]
 _OTHER, _LEAST_RISE = 0.2, 0.25
 _MOST_MINIMA, _BETTER = 3, 1e-3  # local minima that are left, and the least reduction of the cost
-_LEAST_KNOWN = 0.03  # largest standard deviation of the focal length, relative [own]
+# The errors of a corner in the keyframes of a chain are not independent, because it is followed
+# from one to the next. This is the variance after half of the keyframes, relative to a step.
+_DRIFT = KEYFRAMES / 2.0
+_TWO_SIGMAS = 0.975  # share of the distribution below two standard deviations
+_LEAST_KNOWN = 0.05  # largest standard deviation of the focal length, relative [own]
 _FEWEST_FOR_ZOOM = 6  # chains
 _STATED = " (from EXIF, because the motion does not tell it)"
 _STATED_SIGMA = 0.05  # of a focal length in EXIF: rounded to millimetres, and images are cropped
@@ -208,7 +214,9 @@ def _best_fit(corners: Corners, size: tuple[int, int]) -> _Fit:
         best = min(tried, key=lambda one: one.cost).camera
         fits.append(_Fit(adjust(best, begin(best, corners), corners, _ITERATIONS), corners, False))
     pinhole, fisheye = fits
-    moving = fisheye if fisheye.found.cost < _WIDER * pinhole.found.cost else pinhole
+    wide = _view(fisheye.found.camera) > _WIDE
+    better = wide and fisheye.found.cost < _WIDER * pinhole.found.cost
+    moving = fisheye if better else pinhole
     moving = _without_local_minima(moving)
     start = moving.found
     turning = adjust(start.camera, start.scenes, corners, _ITERATIONS, turning=True)
@@ -255,11 +263,14 @@ def _covariance(found: Adjusted) -> Array:
 def _sigma(found: Adjusted) -> float:
     """Return the relative standard deviation of the focal length: the larger of what the noise of
     the corners causes, and of what the chains disagree by (the sandwich estimator of White,
-    "Maximum likelihood estimation of misspecified models", 1982)."""
+    "Maximum likelihood estimation of misspecified models", 1982). A few chains may agree by chance:
+    twice the result is the distance of Student's distribution within which 95 % lie."""
     covariance, C = _covariance(found), len(found.gradient)
-    formal = found.variance * covariance[LOG_FOCAL, LOG_FOCAL]
+    formal = _DRIFT * found.variance * covariance[LOG_FOCAL, LOG_FOCAL]
     share = covariance[LOG_FOCAL] @ found.gradient.T
-    between = (share**2).sum() * C / max(C - 1, 1)
+    freedom = max(C - 1, 1)
+    few = stdtrit(freedom, _TWO_SIGMAS) / ndtri(_TWO_SIGMAS)
+    between = few**2 * (share**2).sum() * C / freedom
     return float(np.sqrt(max(formal, between)))
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vslam.calibration.from_motion import MotionFit, camera_from_motion
 from vslam.datasets.frames import RawSource, Size
 from vslam.support.errors import BrokenSourceError, InputError, UnreadableImageError
 from vslam.types.camera import Image
 from vslam.types.source_options import SourceOptions
+
+if TYPE_CHECKING:
+    from vslam.calibration.from_motion import MotionFit
 
 SECONDS = 60.0
 """Length of the beginning of a recording that is used."""
@@ -58,6 +61,8 @@ def calibrate_source(raw: RawSource, data: str) -> MotionFit:
     Raises:
         InputError: the motion does not determine the focal length.
     """
+    from vslam.calibration.from_motion import camera_from_motion
+
     size, name = raw.sizes[0], f"{data}: --calib auto"
     return camera_from_motion(_images(raw), size, name, _stated_focal_length(raw, size))
 

@@ -111,7 +111,8 @@ def adjust_locally(
         final = adjust_with_imu(
             refined, chain, iterations=iterations, use=coarse.inlier, tolerance=1e-3
         )
-        if final is None:
+        # With one camera, the scale of the images may be wrong, and not the motion.
+        if final is None and not context.camera.monocular:
             forget_motion(map_, keyframe)
     if final is None:
         final = adjust(refined, iterations=iterations, use=coarse.inlier, tolerance=1e-3)

@@ -8,12 +8,16 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-
 from vslam.backend.disparity_offset import map_and_calibrate
 from vslam.backend.keyframe_motions import record_motion
 from vslam.backend.local_mapping import MIN_SHARED, refresh_keyframe
-from vslam.backend.metric_mapping import MapScale, adjust_widely, is_wide, scale_of_map
+from vslam.backend.metric_mapping import (
+    MapScale,
+    adjust_widely,
+    is_wide,
+    record_missing_motions,
+    scale_of_map,
+)
 from vslam.backend.triangulation import map_stereo_points
 from vslam.frontend.patches import certainty_of
 from vslam.method.closing import LoopClosing
@@ -161,9 +165,7 @@ class Mapper:
         R_wc = self.published.frames.pose(-1)[:3, :3].T
         with self.published.change() as map_:
             first = newest_unit(map_)
-            missing = np.flatnonzero(map_.keyframes.motion_seconds[: map_.n_keyframes] == 0.0)
-            for keyframe in missing[missing > first].tolist():
-                record_motion(map_, keyframe, inertial)
+            record_missing_motions(map_, first, inertial)
             return scale_of_map(map_, first, self._context, inertial, R_wc, start)
 
     def rescale(self, scale: float, inertial: InertialWindow, *tracks: Track) -> tuple[Track, ...]:
@@ -225,12 +227,14 @@ class Mapper:
 
     def _adjust_widely(self, map_: Map, inertial: InertialWindow) -> None:
         """Adjust the newest keyframes with what is known from the IMU at the last frame."""
+        record_missing_motions(map_, newest_unit(map_), inertial)
         keyframe, R_wc = int(map_.living_keyframes()[-1]), self.published.frames.pose(-1)[:3, :3].T
         adjust_widely(map_, keyframe, self._context, inertial, R_wc)
 
     def _map_keyframe(self, keyframe: int, inertial: InertialWindow | None, map_: Map) -> None:
         map_and_calibrate(map_, keyframe, self._context, inertial)
         if self._context.camera.monocular and inertial is not None and is_wide(map_, keyframe):
+            record_missing_motions(map_, newest_unit(map_), inertial)
             R_wc = map_.keyframe_pose(keyframe)[:3, :3].T
             adjust_widely(map_, keyframe, self._context, inertial, R_wc)
         self._closing.apply_adjustment_if_due(map_, keyframe)

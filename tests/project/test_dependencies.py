@@ -118,7 +118,7 @@ ONLY_IN = {
     "mcap": ("vslam.datasets.bag_files", "vslam.datasets.bag_limits"),
     "mcap_protobuf": "vslam.datasets.bag_files",
     "pymap3d": "vslam.datasets.fixes",
-    "PIL": "vslam.datasets.image_folders",
+    "PIL": ("vslam.datasets.image_folders", "vslam.datasets.auto_calibration"),
     "pyorbslam3": "vslam_lab.stress.orbslam3",
     "deflate": "vslam.datasets.png",
     "typer": ("vslam.cli", "vslam_lab.cli"),

@@ -31,16 +31,21 @@ _PATCH_LEAD_FRAMES = 2
 # fraction of the landmarks of the reference keyframe. [OS1 V-E, customary]
 _URGENT_RATIO = 0.25
 # With a monocular camera, a keyframe is also inserted while local mapping is busy if fewer
-# landmarks than this are tracked. [own]
+# landmarks than this are tracked. If the frame was tracked by patches, it is inserted afterwards.
+# [own]
 _MONOCULAR_MIN_TRACKED = 100
 # The same fraction for a monocular camera. [own]
 _MONOCULAR_URGENT_RATIO = 0.5
+# A monocular frame that was tracked by patches becomes a keyframe if it tracks less than this
+# fraction of the landmarks that were tracked when those of the last keyframe had been triangulated.
+# With a smaller fraction, the map has too few landmarks for a fast turn. [own]
+_MONOCULAR_PATCH_KEPT = 0.8
 
 
 @dataclass(frozen=True)
 class KeyframeEvidence:
     """The quantities that a keyframe decision depends on. Close points have a depth that stereo
-    measures accurately.
+    measures accurately. With a monocular camera, all points that are tracked count as close.
 
     Attributes:
         seconds_since_keyframe: time since the last keyframe, seconds.
@@ -57,6 +62,8 @@ class KeyframeEvidence:
         gained_close: number of close points that the first frame after a keyframe tracks, as a
             running mean over the last keyframes. It is infinite if unknown.
         first_close: number of close points that the first frame after the last keyframe tracks.
+            With a monocular camera, it is the first frame that sees the landmarks that were
+            triangulated at the last keyframe. It is 0 before.
         close_ratio: factor, at most 1, by which the number of tracked close points has changed per
             frame since the first frame after the last keyframe.
     """
@@ -127,8 +134,16 @@ def needs_monocular_keyframe(evidence: KeyframeEvidence, config: KeyframeConfig)
     from different positions. Redundant keyframes are culled later. The time since the last keyframe
     is not a reason by itself, because nothing new can be triangulated while the camera stands
     still.
+
+    A frame that was tracked by patches is compared with the first frame that tracked the landmarks
+    of the last keyframe. Landmarks are lost because they leave the image, or because they look
+    different after a large motion. In both cases, it is time to triangulate new ones. They are
+    visible only after mapping, so there is no reason to insert another keyframe before.
     """
     tracked, reference = evidence.n_inliers, evidence.n_reference
+    if evidence.untracked_close is None:
+        least = max(_MONOCULAR_PATCH_KEPT * evidence.first_close, _MONOCULAR_MIN_TRACKED)
+        return evidence.mapping_idle and tracked < least
     if tracked >= config.monocular_ratio * reference:
         return False
     # In a sharp turn, the view changes faster than it is mapped, so the keyframe cannot wait.
@@ -199,10 +214,14 @@ class KeyframePolicy:
             depth = feature_depth(track.features, self._context.camera)
             close = depth < self._context.close_depth
             untracked_close = int(np.count_nonzero(close & ~tracked))
+        monocular = self._context.camera.monocular
+        if monocular:
+            close = tracked
         stride = view.patch_stride if track.by_patches else 1
         tracked_close = stride * int(np.count_nonzero(close & tracked))
-        state = count_close(self.state, tracked_close, track.index)
-        self.state = state
+        if mapping_idle or not monocular:
+            self.state = count_close(self.state, tracked_close, track.index)
+        state = self.state
         return KeyframeEvidence(
             seconds_since_keyframe=seconds_since_keyframe,
             n_inliers=stride * int(np.count_nonzero(tracked)),
@@ -211,7 +230,7 @@ class KeyframePolicy:
             untracked_close=untracked_close,
             mapping_idle=mapping_idle,
             gained_close=state.gained_close,
-            first_close=state.first_close,
+            first_close=0 if state.gain_awaited else state.first_close,
             close_ratio=close_ratio(state, tracked_close, track.index),
         )
 

@@ -125,6 +125,8 @@ class Tracker:
             return (1.0 if is_plausible(track) else IMPLAUSIBLE) * track.support
 
         def is_plausible(track: PatchTrack) -> bool:
+            if self._context.camera.monocular:  # the unit of the map is not a metre
+                return True
             jump = np.linalg.norm((track.T_cw @ inverse(T_cw))[:3, 3])
             return bool(jump <= ACCELERATION * predicted.seconds**2)
 

@@ -28,7 +28,7 @@ HEAD = """# Thresholds
 
 `vslam/config.py` has all thresholds, from which `python tools/threshold_table.py` writes this page. [The design](../explanation/design.md) describes the methods that use them. There are four ways to change them:
 
-- On the command line: `vslam run --config orb.n_features=1500,tracking.method=patches`.
+- On the command line: `vslam run --config orb.n_features=1500,tracking.method=orb`.
 - In a JSON file: `vslam run --config FILE`, with `{"orb": {"n_features": 1500}}` or `{"orb.n_features": 1500}` in it.
 - In Python: `Slam(camera, config={"orb.n_features": 1500})`.
 - With a [preset](#presets): `vslam run --config fast,orb.n_features=1000`, or `Slam(camera, config="fast")`.

@@ -119,10 +119,10 @@ class AlignmentConfig(Section):
 class TrackingConfig(Section):
     """Frame-to-map tracking."""
 
-    method: Literal["auto", "orb", "patches"] = "auto"
-    """`orb` matches ORB features in every frame. `patches` searches for image patches of the
-    landmarks (Forster et al., T-RO 2017), and extracts features only when a keyframe is due or too
-    few patches are found. `auto` is `orb` for a monocular camera and `patches` otherwise. [own]"""
+    method: Literal["orb", "patches"] = "patches"
+    """`patches` searches for image patches of the landmarks (Forster et al., T-RO 2017), and
+    extracts features only when a keyframe is due or too few patches are found. `orb` matches ORB
+    features in every frame. [own]"""
     patch_min_inliers: int = Field(40, ge=10)
     """Features are extracted if fewer patches than this agree with the pose. [own]"""
     patch_min_inlier_ratio: float = Field(0.8, ge=0, le=1)

@@ -130,6 +130,25 @@ def test_one_camera_needs_no_keyframe_by_time_alone():
     assert decide_monocular(seconds_since_keyframe=1.0, n_inliers=179, mapping_idle=False)
 
 
+def test_one_camera_without_features_needs_a_keyframe_once_a_fifth_is_gone_or_little_is_left():
+    first = {"untracked_close": None, "first_close": 400, "n_reference": 1000}
+    assert not decide_monocular(**first, n_inliers=320)
+    assert decide_monocular(**first, n_inliers=319)
+    assert not decide_monocular(**first, n_inliers=20, mapping_idle=False)
+    assert not decide_monocular(**{**first, "first_close": 0}, n_inliers=100)
+    assert decide_monocular(**{**first, "first_close": 110}, n_inliers=99)
+
+
+def test_one_camera_counts_what_is_left_of_the_newest_landmarks_once_they_are_mapped():
+    one = KeyframePolicy(Context.create(CAMERA.left_camera(), Config()))
+    one.reference_renewed()
+    before = observe(one, frame(close=10), mapping_idle=False)
+    assert (before.tracked_close, before.first_close) == (10, 0)
+    after = observe(one, frame(close=40), mapping_idle=True)
+    assert (after.tracked_close, after.first_close) == (40, 40)
+    assert observe(one, frame(close=30), mapping_idle=True).first_close == 40
+
+
 KNOWN = {"n_inliers": 150, "n_shared": 100, "n_place": 200}
 
 

@@ -12,6 +12,7 @@ import pytest
 from vslam.config import Config
 from vslam.datasets import open_sequence
 from vslam.datasets.perturbation import Perturbation
+from vslam.evaluation.trajectories import evaluate_trajectory
 from vslam.frontend.extraction import FrameImages
 from vslam.frontend.images import GivenFeatures
 from vslam.frontend.orb import build_pyramid, level_shapes
@@ -28,6 +29,7 @@ from vslam.support.errors import UnreadableImageError
 from vslam.types.context import Context
 from vslam.types.features import Extracted, TrackingState
 from vslam.types.geometry import inverse, se3_exp, se3_log, transform
+from vslam.types.trajectory import Trajectory
 
 CONFIG = Config.model_validate({"tracking": {"method": "patches"}})
 FEATURES = Config.model_validate({"tracking": {"method": "orb"}})
@@ -284,9 +286,25 @@ def test_the_same_bytes_with_two_threads_and_after_a_resume(corridor, tmp_path):
     assert resumed >= 3
 
 
-def test_cameras_are_tracked_by_patches_or_by_features(corridor):
-    for camera in (corridor.camera, replace(corridor.camera, depth=True)):
+def test_one_camera_is_tracked_by_patches_between_keyframes(corridor):
+    slam = Slam(corridor.camera.left_camera(), Config(), "none", threads=1)
+    results = [
+        slam.step(left, None, timestamp)
+        for left, timestamp in zip(corridor.left, corridor.timestamps, strict=True)
+    ]
+    slam.finish()
+    begun = next(k for k, result in enumerate(results) if result.is_keyframe)
+    assert begun < 5
+    assert all(result.state == TrackingState.OK for result in results[begun:])
+    without = [result for result in results[begun:] if not result.n_features]
+    assert not any(result.is_keyframe for result in without)
+    assert len(without) > len(corridor) / 2
+    truth = Trajectory(corridor.timestamps, corridor.T_wc)
+    assert evaluate_trajectory(slam.trajectory(), truth, "sim3").ate_rmse_m < 0.05
+
+
+def test_all_cameras_are_tracked_by_patches_unless_asked_otherwise(corridor):
+    depth, alone = replace(corridor.camera, depth=True), corridor.camera.left_camera()
+    for camera in (corridor.camera, depth, alone):
         assert Context.create(camera, Config()).tracks_patches
-    assert Context.create(corridor.camera.left_camera(), CONFIG).tracks_patches
-    assert not Context.create(corridor.camera.left_camera(), Config()).tracks_patches
-    assert not Context.create(corridor.camera, FEATURES).tracks_patches
+        assert not Context.create(camera, FEATURES).tracks_patches

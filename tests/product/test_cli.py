@@ -500,7 +500,7 @@ def test_run_writes_its_folder_and_a_summary(call, root, pipeline):
 
 
 def test_changed_thresholds_are_in_the_name_of_the_folder_and_the_summary(call, root, pipeline):
-    config = "orb.n_features=1000,orb.n_levels=7,tracking.method=patches,depth.min_metres=0.5"
+    config = "orb.n_features=1000,orb.n_levels=7,tracking.method=orb,depth.min_metres=0.5"
     code, out, err = call("run", "--data", root, "--max-frames", 10, "--config", config)
     assert code == 0, err
     assert (
@@ -509,7 +509,7 @@ def test_changed_thresholds_are_in_the_name_of_the_folder_and_the_summary(call, 
     folder = Path("runs/latest").resolve()
     assert folder.name.endswith("-kitti-00-none-both-orb.n_features=1000+3more")
     report = ReportJson.read(folder / "report.json")
-    assert report.thresholds["tracking.method"] == "patches"
+    assert report.thresholds["tracking.method"] == "orb"
     row = dict(option_rows(report))["thresholds"]
     assert row == ", ".join(f"{name}={value}" for name, value in report.thresholds.items())
     assert "thresholds" not in dict(option_rows(report.model_copy(update={"thresholds": {}})))

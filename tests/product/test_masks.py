@@ -53,7 +53,7 @@ def hooded(corridor):
     return left, right
 
 
-def driven(corridor, images, mask, method="auto"):
+def driven(corridor, images, mask, method="patches"):
     """Return the SLAM after all frames, its results, and its ATE in metres."""
     slam = Slam(corridor.camera, {"tracking": {"method": method}}, "none", threads=1)
     results = [

@@ -135,7 +135,7 @@ def test_a_monocular_map_begins_with_the_second_view():
     assert drive.published.n_keyframes == 2
     assert drive.published.map.frames.tolist() == [0, second.index]
     assert drive.mode.state() is not None
-    assert drive.mode.state().gain_awaited is False
+    assert drive.mode.state().gain_awaited
 
 
 @pytest.mark.parametrize("twist", [TWIST, None])

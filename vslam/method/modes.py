@@ -157,6 +157,7 @@ class Building:
         for found in track_waiting(start, first, second, self._published.view, self._tracker):
             self._published.frames.find(found.index, found.T_cw, beside=first.index)
         self.starter.reset()
+        self.policy.reference_renewed()
         return second
 
     def map_far_points(self, last: Track | None) -> Track | None:

@@ -44,8 +44,7 @@ class Context:
     @property
     def tracks_patches(self) -> bool:
         """Whether frames are tracked using image patches when possible."""
-        method = self.config.tracking.method
-        return not self.camera.monocular if method == "auto" else method == "patches"
+        return self.config.tracking.method == "patches"
 
     @property
     def aligned_certainty(self) -> int:

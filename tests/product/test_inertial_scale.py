@@ -79,9 +79,7 @@ def test_the_map_becomes_metric_when_the_motion_tells_its_scale(drive):
     assert since - TIMES[first] < 3.0
     assert all((one.gravity is not None) == (one.timestamp > since) for one in results)
     n = len(drive.at_start)
-    assert scale_of(drive.at_start[first:], TRUTH[first:n]) == pytest.approx(
-        1.0, abs=0.02
-    )  # the accepted sigma
+    assert scale_of(drive.at_start[first:], TRUTH[first:n]) == pytest.approx(1.0, abs=0.02)
     T_wc = drive.slam.trajectory().T_wc
     light = slice(first, DARK.start)
     assert scale_of(T_wc[light], TRUTH[light]) == pytest.approx(1.0, abs=0.01)

@@ -17,6 +17,7 @@ from vslam.method.inertia import (
     IMU_REFUSED,
     KEPT_S,
     gravity_direction,
+    is_stuck,
     lost,
     moves,
     predicted_state,
@@ -323,6 +324,14 @@ def test_gravity_is_as_certain_as_it_says():
         errors.append(np.linalg.norm(np.cross(one.direction, true)) / one.sigma / np.sqrt(2.0))
         assert np.linalg.norm(one.direction) == pytest.approx(1.0)
     assert 0.3 < np.sqrt(np.mean(np.square(errors))) < 2.0
+
+
+def test_a_gyroscope_that_is_stuck_is_known():
+    rows = samples()[:40].copy()
+    assert not is_stuck(rows)
+    rows[30:, 2] = 0.0  # one axis
+    assert is_stuck(rows)
+    assert not is_stuck(rows[:39])
 
 
 def test_old_samples_are_forgotten():

@@ -94,6 +94,7 @@ IMPLAUSIBLE, DOUBTS, MOST_REFUSED = 22.5, (1.0, 10.0, 100.0), 5
 # samples did not agree, or a state that had to be found anew. They are forgotten if a state has
 # agreed with the poses for AGREED_S seconds.
 MOST_DISAGREEMENTS, AGREED_S = 5, 3.0
+STUCK = 10  # samples with the same number, after which a gyroscope is stuck
 IMU_REFUSED = (
     "The IMU is not used, because its samples contradict the motion in the images: check "
     "T_imu_camera (it maps points of the left camera to the IMU), its time_offset, and the units "
@@ -113,6 +114,13 @@ SCALE_LOST = (
 def is_refused(inertia: Inertia) -> bool:
     """Return whether the IMU is not used, because it contradicts the images."""
     return inertia.disagreements >= MOST_DISAGREEMENTS
+
+
+def is_stuck(samples: Matrix) -> bool:
+    """Return whether an axis of the gyroscope has given the same number ``STUCK`` times in a row,
+    which the noise of a sound one does not allow."""
+    newest = samples[-STUCK:, 1:4]
+    return len(newest) == STUCK and bool((np.ptp(newest, axis=0) == 0.0).any())
 
 
 def with_samples(inertia: Inertia, samples: ArrayLike, kept_s: float = KEPT_S) -> Inertia:

@@ -27,6 +27,7 @@ from vslam.method.inertia import (
     guessed_scale,
     in_metres,
     is_refused,
+    is_stuck,
     lost,
     moves,
     noise_for_bundles,
@@ -282,7 +283,7 @@ class Motion:
 
         If the filter has refused the pose of the images, it is used nevertheless, because the state
         may be wrong, unless the camera turned in another way: a gyroscope errs little in so short a
-        time. The pose that the samples predict is then used.
+        time. The pose that the samples predict is then used, unless the gyroscope is stuck.
         """
         state = inertia.state
         if self._imu is None or predicted.inertial is None or state is None:
@@ -290,7 +291,8 @@ class Motion:
         T_odom_fused = camera_pose(state, self._imu.T_imu_camera)
         if inertia.refused:
             turned = T_odom_fused[:3, :3].T @ odometry.T_odom_camera[:3, :3]
-            if not np.trace(turned) < 1.0 + 2.0 * np.cos(WRONG_TURN):
+            agree = not np.trace(turned) < 1.0 + 2.0 * np.cos(WRONG_TURN)
+            if agree or is_stuck(self.state.inertia.samples):
                 return track, odometry
         T_fused_seen = self._as_tracked(inverse(T_odom_fused) @ odometry.T_odom_camera)
         track = replace(track, T_cw=orthonormalised(T_fused_seen @ track.T_cw))

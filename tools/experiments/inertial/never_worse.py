@@ -37,7 +37,7 @@ def gravity_errors(run: Run, route: Route) -> tuple[float, float, float]:
         return np.nan, np.nan, np.nan
     cosine = run.gravity @ down / np.linalg.norm(run.gravity, axis=1)
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    later = known[0] + round(2.0 * route.rate)
+    later = min(known[0] + round(2.0 * route.rate), len(angle) - 1)
     return known[0] / route.rate, float(angle[later]), float(np.nanmax(angle[later:]))
 
 

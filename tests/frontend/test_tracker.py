@@ -657,7 +657,7 @@ def test_lost_frames_are_counted_until_one_is_found_or_begins_a_map():
     drive.accept(4)
     assert drive.expected(0.5).is_tracking
     drive.lose(5)
-    drive.motion.keyframe()
+    drive.motion.keyframe(last)
     assert drive.expected(0.6).is_tracking
 
 

@@ -133,8 +133,7 @@ def chain_in(
         cameras: ``(K,)`` ids of the keyframes of the window.
     """
     a, restarts = map_.arrays, map_.restarts
-    index = np.full(map_.n_keyframes, -1, np.int64)
-    index[cameras] = np.arange(len(cameras))
+    index = map_.places_among(cameras)
     ids: list[int] = []
     for one in range(keyframe, -1, -1):
         if not a.keyframe_alive[one]:
@@ -226,8 +225,7 @@ def assemble(
     """
     a = map_.arrays
     cameras = np.concatenate([free, fixed])
-    index = np.full(map_.n_keyframes, -1, np.int64)
-    index[cameras] = np.arange(len(cameras))
+    index = map_.places_among(cameras)
     first, rows = gather_observations(a, landmarks, index)
     problem = BundleProblem(
         T_cw=a.T_cw[cameras],

@@ -95,7 +95,7 @@ def scale_of_map(
     T_cw = problem.T_cw.copy()
     T_cw[:, :3, 3] *= start
     problem = replace(problem, T_cw=T_cw, points=start * problem.points)
-    chain = replace(chain, camera=_indices(map_, cameras)[ids])
+    chain = replace(chain, camera=map_.places_among(cameras)[ids])
     found = adjust_with_imu(problem, chain, iterations=_ITERATIONS, tolerance=_TOLERANCE)
     if found is None:
         return None
@@ -128,7 +128,7 @@ def adjust_widely(
     if ids[0] == 0 or not len(fixed):
         free, fixed = ids[1:], np.concatenate([ids[:1], fixed])
     problem, rows = assemble(map_, free, fixed, landmarks, context.camera)
-    chain = replace(chain, camera=_indices(map_, np.concatenate([free, fixed]))[ids])
+    chain = replace(chain, camera=map_.places_among(np.concatenate([free, fixed]))[ids])
     found = adjust_with_imu(problem, chain, iterations=_ITERATIONS, tolerance=_TOLERANCE)
     if found is None:
         return
@@ -178,13 +178,6 @@ def _newest_chain(
     unknown[BIAS, BIAS] = np.diag(np.repeat([GYRO_BIAS**2, ACCEL_BIAS**2], 3))
     found = replace(inertial, state=replace(inertial.state, covariance=unknown))
     return chain_of(found, motions_between(map_, ids), ids, R_world_camera)
-
-
-def _indices(map_: Map, cameras: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index of each keyframe of the map among the cameras of a problem, or -1."""
-    index = np.full(map_.n_keyframes, -1, np.int64)
-    index[cameras] = np.arange(len(cameras))
-    return index
 
 
 def _scale_sigma(problem: BundleProblem, chain: InertialChain, use: NDArray[np.bool_]) -> float:

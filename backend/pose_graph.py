@@ -134,8 +134,7 @@ def essential_graph(
         ValueError: a loop has no pose.
     """
     living = map_.living_keyframes()
-    index = np.full(map_.n_keyframes, -1, np.int64)
-    index[living] = np.arange(len(living))
+    index = map_.places_among(living)
     T_cw = map_.arrays.T_cw[living]
     pairs, shared = covisible_pairs(map_.arrays, living, map_.n_keyframes, _MIN_SHARED_TREE)
     seen = set(map(tuple, pairs.tolist()))

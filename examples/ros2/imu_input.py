@@ -46,7 +46,8 @@ class ImuInput:
         self._calibration, self._topics = found, topics
         self._samples = SplitSamples()
         self._feed = ImuFeed(Imu(" and ".join(topics), self._samples.read, found, live=True))
-        self._in_vain: float | None = None  # the newest sample when an image last waited in vain
+        # The newest sample when the wait of an image ended without a later one
+        self._in_vain: float | None = None
         self._has_complained = False
 
     def calibration(self, left: Any) -> ImuCalibration:
@@ -62,7 +63,7 @@ class ImuInput:
         return replace(self._calibration, T_imu_camera=T)
 
     def add(self, topic: str, message: Any) -> None:
-        """Add a message ``sensor_msgs/Imu`` of one of the topics."""
+        """Add a ``sensor_msgs/Imu`` message that has arrived on one of the topics."""
         time, *values = inertial_sample(message)
         if topic == self._topics[0]:
             self._samples.add_rate(time, *values[:3])
@@ -72,7 +73,7 @@ class ImuInput:
     def is_awaited(self, timestamp: float, waited_s: float) -> bool:
         """Return whether an image should wait for a sample that is not before it.
 
-        After an image has waited in vain, no other one waits until a sample has come.
+        If no sample comes while an image waits, later images do not wait until the next sample.
 
         Args:
             timestamp: time of the image in seconds.

@@ -94,8 +94,11 @@ class _RightImages:
 
 
 def _right_images(map_: Map, camera: Camera, session: int | None = None) -> _RightImages | None:
-    """Return the features in the right images of a map, or of one of its drives; None if there are
-    too few."""
+    """Return the features that a map has in right images. None if there are too few of them.
+
+    Args:
+        session: the only drive whose features are used; None uses those of all drives.
+    """
     if camera.sensor != "stereo" or map_.n_keyframes < 3:
         return None
     arrays = map_.arrays

@@ -469,6 +469,13 @@ class Map:
         """Return the ids of the keyframes that have not been culled."""
         return np.flatnonzero(self.arrays.keyframe_alive[: self.n_keyframes])
 
+    def places_among(self, keyframes: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the place of each keyframe of the map in an array of ids, or -1 if it is not
+        among them."""
+        places = np.full(self.n_keyframes, -1, np.int64)
+        places[keyframes] = np.arange(len(keyframes))
+        return places
+
     def living_landmarks(self) -> NDArray[np.int64]:
         """Return the ids of the landmarks that were not culled or fused with another landmark."""
         return np.flatnonzero(self.arrays.landmark_alive[: self.n_landmarks])

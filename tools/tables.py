@@ -112,12 +112,9 @@ def write_loops(report: LoopsJson, folder: Path) -> None:
     """Write the tables for which the report has results, and its curves."""
     folder.mkdir(parents=True, exist_ok=True)
     cells = report.cells
-    ordered = [cell for cell in cells if cell.sequence_right is not None]
     tables = {
         "average_precision": _average_precision(report),
         "places_found": _wide([cell for cell in cells if cell.verified], _places),
-        "sequences": _wide(ordered, _sequence),
-        "verification": [_verification(cell) for cell in cells if cell.verified],
         "scores": [_score(cell) for cell in cells],
         "top_k": [_top(cell) for cell in cells if cell.top_average_precision],
         "online": [_online(score) for score in report.online],
@@ -178,22 +175,8 @@ def _places(cell: Score) -> Row:
     }
 
 
-def _sequence(cell: Score) -> Row:
-    return {"": _share(cell.first_right), " over sequences": _share(cell.sequence_right)}
-
-
 def _named(cell: Score) -> Row:
     return {"images": cell.data, "condition": cell.condition, "detector": cell.detector}
-
-
-def _verification(cell: Score) -> Row:
-    row = _named(cell) | {
-        "queries": str(cell.queries),
-        "best_image_right": _share(cell.first_right),
-    }
-    for by, found in cell.verified.items():
-        row |= {f"{by}_right": _share(found.right), f"{by}_wrong": str(found.wrong)}
-    return row
 
 
 def _score(cell: Score) -> Row:

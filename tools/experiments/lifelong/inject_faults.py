@@ -3,7 +3,7 @@ r"""Make each part of vslam fail once during a run, and record the messages and 
 tests/faults.py defines the faults and the points of a run at which they are injected. It also
 decides whether an outcome is correct.
 
-    python tools/experiments/lifelong/inject_faults.py --out docs/research/lifelong/faults.csv
+    python tools/experiments/lifelong/inject_faults.py --out faults.csv
 """
 
 from __future__ import annotations

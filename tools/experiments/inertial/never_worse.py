@@ -1,19 +1,21 @@
 """Compare ordinary drives with and without the IMU: it must not make them worse.
 
     python tools/experiments/inertial/never_worse.py --out never_worse.csv
-    python tools/experiments/inertial/never_worse.py --sensors stereo mono rgbd --out sensors.csv
+    python tools/experiments/inertial/never_worse.py --sensors stereo mono rgbd --seeds 60 61 \
+        --out sensors.csv
 
 Errors are those of the frames since the first one that was tracked, after a rigid alignment, also
-of one camera. ``scale`` is by how much a similarity would scale the poses. ``lost`` counts lost
-frames after the first one that was tracked, whose time is ``first_s``.
-``rpe_m`` and ``rpe_deg`` are errors of the motion over one second. ``gravity_2s_deg`` is the error
-of gravity two seconds after it was found, and ``gravity_deg`` the largest one from then on.
+of one camera. ``scale_percent`` is by how much a similarity would scale the poses. ``lost`` counts
+lost frames after the first one that was tracked, whose time is ``first_s``. ``rpe_m`` and
+``rpe_deg`` are errors of the motion over one second. ``gravity_2s_deg`` is the error of gravity two
+seconds after it was found, and ``gravity_deg`` the largest one from then on.
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +27,7 @@ DRIVES = (
     ("room", 25), ("room", 26), ("hall", 25), ("hall", 26), ("walk", 25), ("walk", 26),
     ("drone", 25), ("demo", 25), ("00", 25), ("03", 25),
 )  # fmt: skip
-OF_SENSORS = ("room", 60), ("hall", 60), ("walk", 60), ("drone", 60), ("demo", 60)
+OF_SENSORS = "room", "hall", "walk", "drone", "demo"
 SECONDS = 14.0
 
 
@@ -45,12 +47,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--towns", type=Path, default=cache_folder())
     parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=["vslam"])
-    parser.add_argument("--first", type=int, default=len(DRIVES), help="only the first drives")
+    parser.add_argument("--first", type=int, default=None, help="only the first drives")
     parser.add_argument("--sensors", nargs="+", choices=("stereo", "mono", "rgbd"))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[60], help="with --sensors")
+    parser.add_argument("--repeats", type=int, default=1, help="runs of each drive")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     rows: list[dict[str, object]] = []
-    drives, sensors = (OF_SENSORS if options.sensors else DRIVES), options.sensors or ["stereo"]
+    of_sensors = [(name, seed) for seed in options.seeds for name in OF_SENSORS]
+    drives, sensors = (of_sensors if options.sensors else DRIVES), options.sensors or ["stereo"]
     for name, seed in drives[: options.first]:
         route = built_in(name, seed)
         frames = slice(0, round(SECONDS * route.rate))
@@ -58,14 +63,14 @@ def main() -> None:
             made = "rgbd" if options.sensors else "stereo"  # all sensors share the images
             drive = drive_of(route, seed, options.towns, frames=frames, sensor=made)
             drive = replace(drive, sensor=sensor)
-            for system in options.systems:
-                for imu in (True, False):
-                    run = SYSTEMS[system](drive, imu=imu)
-                    rows.append({
-                        "drive": f"{name}, seed {seed}", "sensor": sensor, "system": system,
-                        "imu": "yes" if imu else "no", **measured(run, drive, route),
-                    })  # fmt: skip
-                    print(rows[-1], flush=True)
+            settings = product(options.systems, (True, False), range(options.repeats))
+            for system, imu, _ in settings:
+                run = SYSTEMS[system](drive, imu=imu)
+                rows.append({
+                    "route": name, "drive": f"{name}, seed {seed}", "sensor": sensor,
+                    "system": system, "imu": "yes" if imu else "no", **measured(run, drive, route),
+                })  # fmt: skip
+                print(rows[-1], flush=True)
     write_rows(options.out, rows)
 
 
@@ -79,7 +84,8 @@ def measured(run: Run, drive: Drive, route: Route) -> dict[str, object]:
     return {
         "frames": len(drive.times), "lost": int(run.lost[first:].sum()),
         "first_s": first / route.rate, "ate_m": ate(final, truth),
-        "scale": scale_error(final, truth), "rpe_m": metres, "rpe_deg": degrees,
+        "scale_percent": 100.0 * abs(scale_error(final, truth)),
+        "rpe_m": metres, "rpe_deg": degrees,
         "gravity_since_s": since, "gravity_2s_deg": soon, "gravity_deg": later,
     }  # fmt: skip
 

@@ -37,7 +37,7 @@ IMU.GyroWalk: {noise[2]}
 IMU.AccWalk: {noise[3]}
 IMU.Frequency: 200
 IMU.fastInit: 1
-RGBD.DepthMapFactor: 1.0
+DepthMapFactor: 1.0
 Tbc: !!opencv-matrix
    rows: 4
    cols: 4

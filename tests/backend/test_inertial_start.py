@@ -225,6 +225,15 @@ def test_shares_of_motion_and_vibration_count_as_noise_also_if_samples_are_missi
     assert noise_in_motion(ADIS16448, samples[:3]) == ADIS16448
 
 
+def test_samples_at_alternating_intervals_tell_no_vibration():
+    rows = np.zeros((12, 7))
+    rows[1:, 0] = np.cumsum(np.resize([0.010, 0.016], 11))
+    rows[:, 4:] = np.random.default_rng(0).standard_normal((12, 3))
+    share = MOTION * np.sqrt(np.sum(np.var(rows[:, 4:], axis=0)))
+    noise = noise_in_motion(ADIS16448, rows)
+    assert noise.accel == pytest.approx(np.hypot(ADIS16448.accel, share), rel=1e-6)
+
+
 def test_a_drift_of_the_world_changes_nothing_in_the_frame_of_the_imu():
     """Gravity and velocity, seen from the IMU, stay as uncertain as they were."""
     found, _ = started(Flight(1), 1)

@@ -20,26 +20,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vslam.backend.inertial_filter import (
-    FALL,
     SPEED,
-    TURN,
     anchored,
     camera_covariance,
     camera_pose,
     corrected_by_pose,
     corrected_by_rest,
     drifted,
+    fall_in_imu,
     in_another_world,
     moved,
     noise_in_motion,
 )
 from vslam.backend.inertial_start import MAX_MISFIT, GravityState, PoseStretch, find_gravity
-from vslam.backend.preintegration import cross_matrix, preintegrate, so3_log
+from vslam.backend.preintegration import preintegrate, so3_log
 from vslam.method.gyro import LONGEST_GAP, with_known_bias
 from vslam.types.frame_poses import PoseRun
 from vslam.types.geometry import Matrix, inverse
 from vslam.types.imu import (
-    GRAVITY,
     GravityDirection,
     ImuCalibration,
     ImuNoise,
@@ -80,7 +78,6 @@ SIGMA_PER_M = 0.005  # share of the distance between two frames, if that is larg
 # path got 0.3 % too long, and with 10, the samples improve little. On other drives, BUNDLE_PRIOR
 # changes the length of the path by at most 0.05 %. [own]
 BUNDLES, BUNDLE_PRIOR = 3.0, 10.0
-_TURN_AND_FALL = np.ix_(*[np.r_[TURN, FALL]] * 2)
 REST_SIGMA = 0.01  # m/s, standard deviation of the velocity of a camera that stands still
 MOVES = 16.3  # chi-square of three degrees of freedom, 0.001
 # A camera that stood still has moved off if the samples of a frame show more than this, in m/s^2
@@ -181,7 +178,8 @@ def tracked(
         T_odom_camera: ``(4, 4)`` pose of the frame.
         covariance: ``(6, 6)`` of this pose (``PoseUncertainty.local``).
     """
-    inertia = replace(inertia, carried_s=0.0)
+    if inertia.carried_s:
+        inertia = replace(inertia, carried_s=0.0)
     if is_refused(inertia):
         return inertia
     if predicted is None:  # unknown, or samples are missing
@@ -373,12 +371,9 @@ def predicted_covariance(predicted: InertialState, calibration: ImuCalibration) 
 
 def gravity_direction(state: InertialState, calibration: ImuCalibration) -> GravityDirection:
     """Return the direction of free fall in the frame of the camera."""
-    R = state.T_world_imu[:3, :3]
-    gravity = R.T @ state.gravity / GRAVITY
-    A = np.concatenate([cross_matrix(gravity), R.T / GRAVITY], axis=1)  # by the errors of R and g
-    across = np.sum((A @ state.covariance[_TURN_AND_FALL]) * A)
+    gravity, variance = fall_in_imu(state.T_world_imu[:3, :3], state.gravity, state.covariance)
     direction: Matrix = calibration.T_imu_camera[:3, :3].T @ gravity
-    return GravityDirection(direction, float(np.sqrt(across / 2.0)))
+    return GravityDirection(direction, float(np.sqrt(variance)))
 
 
 def _corrected(
@@ -388,9 +383,11 @@ def _corrected(
     other."""
     noise = _noise(covariance)
     for doubt in DOUBTS:
-        D = np.ones(len(predicted.covariance))
-        D[: SPEED.stop] = np.sqrt(doubt)  # what is known of gravity and the biases remains
-        doubted = replace(predicted, covariance=predicted.covariance * np.outer(D, D))
+        doubted = predicted
+        if doubt > 1.0:
+            D = np.ones(len(predicted.covariance))
+            D[: SPEED.stop] = np.sqrt(doubt)  # what is known of gravity and the biases remains
+            doubted = replace(predicted, covariance=predicted.covariance * np.outer(D, D))
         found = corrected_by_pose(doubted, T_odom_camera, noise, calibration.T_imu_camera)
         if found.chi2 <= IMPLAUSIBLE:
             return found.state

@@ -57,7 +57,7 @@ _DEPTH_MIN_INLIER_RATIO = 0.2
 # the reference keyframe, in pixels at octave 0. [own]
 _PREDICTED_WINDOW = 7.0
 # A frame is matched with the local map only if tracking from the previous frame, from the
-# reference keyframe, with `predicted_window` or with `sudden_window` gives at least this many
+# reference keyframe, with `_PREDICTED_WINDOW` or with `_SUDDEN_WINDOW` gives at least this many
 # inliers. Otherwise, the frame is LOST. [OS1 V-B, customary]
 MIN_INLIERS_FRAME = 10
 # A frame with fewer inliers than this in the local map is LOST. Its pose is only predicted. [own]

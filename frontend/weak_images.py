@@ -94,7 +94,7 @@ def without_noise(images: Sequence[Grey], config: WeakImageConfig) -> Sequence[G
     """Filter the noise of ``(H, W)`` uint8 images. Images with normal noise are returned unchanged.
 
     A median filter removes spikes (single bright or dark pixels). A Gaussian blur reduces the other
-    noise to ``noise_left``.
+    noise to 4 grey levels.
     """
     measured = [grain(image, ROW_STRIDE, LEAST_SPIKE) for image in images]
     if max(spikes for _, spikes in measured) > config.spikes_from:
@@ -187,7 +187,7 @@ def with_contrast(image: Grey) -> Grey:
     """Normalise the local contrast of an ``(H, W)`` uint8 image.
 
     The image is blurred by one pixel. Then the grey values are scaled so that the window around
-    every pixel (``contrast_window``) has the same standard deviation. Flat regions, which contain
+    every pixel has the same standard deviation. Flat regions, which contain
     only noise, are amplified less.
     """
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)

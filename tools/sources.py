@@ -18,8 +18,9 @@ The fields of a line, separated by ``|``, are:
   for the mean, median, sum and maximum of column x over all selected rows. ``each x`` stands for
   all values of column x in these rows, in the order of the file. Empty values are left out.
 
-A line that contains only ``-`` skips a row, or the whole table if it is the only line. A comment may also stand before a paragraph. Such a
-comment names columns whose values the paragraph must mention.
+A line that contains only ``-`` skips a row, or the whole table if it is the only line. A comment
+may also stand before a paragraph. Such a comment names columns whose values the paragraph must
+mention.
 """
 
 from __future__ import annotations

@@ -44,9 +44,9 @@ from vslam.types.map import Map
 from vslam.types.map_kernels import cut_path
 from vslam.types.states import ClosingState
 
-# The result of global bundle adjustment is applied `1 + n // observations_per_keyframe` keyframes
-# after its loop, where n is the number of observations. With a smaller value, mapping waits for
-# the result less often. [own]
+# The result of global bundle adjustment is applied `1 + n // _OBSERVATIONS_PER_KEYFRAME` keyframes
+# after its loop, where n is the number of observations. With a smaller value, mapping waits for the
+# result less often. [own]
 _OBSERVATIONS_PER_KEYFRAME = 25000
 
 _log = logging.getLogger(__name__)

@@ -35,7 +35,7 @@ from vslam.support.errors import UnreadableImageError
 from vslam.types.camera import Camera, Image
 
 # The report warns if the measured delay of the right camera differs too much from the delay in
-# the calibration. The difference must exceed this value, in seconds, and also `delay_sigmas`
+# the calibration. The difference must exceed this value, in seconds, and also `_DELAY_SIGMAS`
 # (docs/research/stress.md). [own]
 _LEAST_DELAY = 1.2e-3
 # The report warns of a delay only if the difference also exceeds this many standard deviations of

@@ -11,7 +11,7 @@ A window in which samples and images do not agree is adjusted without the sample
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,7 @@ class InertialChain:
         gravity: ``(3,)`` expected acceleration of free fall in the world, m/s^2.
         bias: ``(6,)`` expected biases.
         information: ``(9, 9)`` inverse covariance of the expected gravity and biases.
+        weight: factor of the information of the motions (``weighed``).
     """
 
     camera: NDArray[np.int64]
@@ -58,11 +59,32 @@ class InertialChain:
     gravity: Matrix
     bias: Matrix
     information: Matrix
+    weight: float = 1.0
 
     @property
     def n_unknowns(self) -> int:
         """Number of unknowns besides the poses: gravity, and the state of each keyframe."""
         return 3 + N_STATE * len(self.camera)
+
+    def weighed(self, noise_factor: float, variance: float) -> InertialChain:
+        """Weigh the samples against images as both really err.
+
+        Args:
+            noise_factor: by how much the noise of the samples was enlarged when they were
+                integrated. It is taken back.
+            variance: mean square of the residuals of the images, divided by the expected one. All
+                other information is multiplied by it, which weighs the images by its inverse, and
+                leaves the limits for their outliers as they are.
+        """
+        weight = variance * noise_factor**2
+        information = variance * self.motions.information
+        information[:, :9, :9] *= noise_factor**2
+        return replace(
+            self,
+            motions=self.motions._replace(information=information),
+            information=variance * self.information,
+            weight=weight,
+        )
 
 
 def chain_of(
@@ -170,7 +192,8 @@ class LinearFactors:
             the unknowns: the increments of the free cameras, of gravity, and of the states of the
             keyframes.
         cost: half the sum of the squared residuals.
-        misfit: mean chi-square of the residuals of rotation, velocity and position.
+        misfit: mean chi-square of the residuals of rotation, velocity and position, with the noise
+            with which the samples were integrated.
     """
 
     hessian: Matrix
@@ -208,4 +231,5 @@ def linear_factors(
     )
     error = np.concatenate([inertial[:3] - chain.gravity, inertial[6:12] - chain.bias])
     chi2 += add_prior(error, chain.information, n_free, hessian, gradient)
-    return LinearFactors(hessian, gradient, 0.5 * chi2, of_motion / len(chain.motions.seconds))
+    misfit = of_motion / (chain.weight * len(chain.motions.seconds))
+    return LinearFactors(hessian, gradient, 0.5 * chi2, misfit)

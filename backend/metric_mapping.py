@@ -21,6 +21,7 @@ from vslam.backend.bundle_adjustment import (
     linearise,
     observations_of,
     reduced_system,
+    robust_cost,
 )
 from vslam.backend.inertial_adjustment import (
     InertialChain,
@@ -40,14 +41,19 @@ from vslam.types.map import CARRIED, Map
 from vslam.types.map_kernels import refresh_landmarks
 
 # The number of newest keyframes that are adjusted together, and after how many new keyframes. They
-# are 10 to 40 s of a drive. [own]
+# are 10 to 40 s of a drive. While the map has fewer than YOUNG keyframes, each adds much to what is
+# known of the scale, and adjustment costs little. [own]
 WIDE_KEYFRAMES, WIDE_EVERY = 100, 20
+YOUNG, YOUNG_EVERY = 40, 5
 _SOON = (4, 8)  # keyframes after the first one of a sub-map
 _ITERATIONS, _TOLERANCE = 15, 1e-6
-# Errors of features are not independent, so the scale of the images drifts by more than bundle
-# adjustment expects. Its standard deviation is multiplied by this. On a street, a scale was wrong
-# by four standard deviations while the car had only begun to turn. [own]
-_INFLATION = 2.0
+# The images' scale drifts by more than the white noise of features explains, because features are
+# biased towards the point that a camera approaches (docs/research/motorway.md). The standard
+# deviation of the drift from one keyframe to the next, for a camera that comes nearer to the scene
+# by its whole distance. On one rendered street, the scale drifted by 4 % between the halves of
+# 60 m, of which white noise explains 0.7 %. [own]
+_DRIFT = 0.1
+_VARIANCES = (0.05, 4.0)  # plausible variances of unit weight
 # What is known of gravity before the adjustment: its length, and hardly its direction (m/s^2, rad).
 _LENGTH, _TILT = 1e-3, 0.1
 
@@ -96,15 +102,32 @@ def scale_of_map(
     T_cw[:, :3, 3] *= start
     problem = replace(problem, T_cw=T_cw, points=start * problem.points)
     chain = replace(chain, camera=map_.places_among(cameras)[ids])
+    found = scale_of_problem(problem, chain, inertial.noise_factor)
+    return None if found is None else replace(found, scale=start * found.scale)
+
+
+def scale_of_problem(
+    problem: BundleProblem, chain: InertialChain, noise_factor: float
+) -> MapScale | None:
+    """Find by how much the positions of all cameras must grow to be in metres.
+
+    Args:
+        problem: all its cameras belong to the chain.
+        noise_factor: see ``InertialChain.weighed``.
+
+    Returns:
+        None if the samples do not agree with the images.
+    """
+    variance = _image_variance(problem)
+    chain = chain.weighed(noise_factor, variance)
     found = adjust_with_imu(problem, chain, iterations=_ITERATIONS, tolerance=_TOLERANCE)
     if found is None:
         return None
-    used = found.inlier
-    problem = replace(problem, T_cw=found.T_cw, points=found.points)
-    before, after = (inverses(T)[:, :3, 3] for T in (T_cw, found.T_cw))
+    before, after = (inverses(T)[:, :3, 3] for T in (problem.T_cw, found.T_cw))
     before, after = before - before.mean(axis=0), after - after.mean(axis=0)
     growth = float(np.sqrt(np.sum(after**2) / np.sum(before**2)))
-    return MapScale(start * growth, _INFLATION * _scale_sigma(problem, chain, used))
+    solved = replace(problem, T_cw=found.T_cw, points=found.points)
+    return MapScale(growth, _scale_sigma(solved, chain, found.inlier, variance))
 
 
 def adjust_widely(
@@ -129,6 +152,7 @@ def adjust_widely(
         free, fixed = ids[1:], np.concatenate([ids[:1], fixed])
     problem, rows = assemble(map_, free, fixed, landmarks, context.camera)
     chain = replace(chain, camera=map_.places_among(np.concatenate([free, fixed]))[ids])
+    chain = chain.weighed(inertial.noise_factor, _image_variance(problem))
     found = adjust_with_imu(problem, chain, iterations=_ITERATIONS, tolerance=_TOLERANCE)
     if found is None:
         return
@@ -155,7 +179,7 @@ def is_wide(map_: Map, keyframe: int) -> bool:
     """Return whether the newest keyframes are adjusted together after a keyframe: regularly, and
     soon after a sub-map has begun, whose scale is that of a distance that the IMU measured."""
     young = map_.restarts and keyframe - map_.restarts[-1] in _SOON
-    return bool(young) or keyframe % WIDE_EVERY == 0
+    return bool(young) or keyframe % (YOUNG_EVERY if keyframe < YOUNG else WIDE_EVERY) == 0
 
 
 def _breaks(map_: Map) -> list[int]:
@@ -180,25 +204,69 @@ def _newest_chain(
     return chain_of(found, motions_between(map_, ids), ids, R_world_camera)
 
 
-def _scale_sigma(problem: BundleProblem, chain: InertialChain, use: NDArray[np.bool_]) -> float:
+def _image_variance(problem: BundleProblem) -> float:
+    """Return the mean square of the residuals of the images, divided by the expected one (the
+    variance of unit weight of a least-squares adjustment). 1 if there are too few residuals."""
+    inlier = np.ones(len(problem.camera), np.bool_)
+    cost = robust_cost(problem.T_cw, problem.points, observations_of(problem, None), inlier)
+    spare = 2 * len(problem.camera) - 3 * len(problem.points) - 6 * problem.n_free
+    return float(np.clip(2.0 * cost / spare, *_VARIANCES)) if spare > 0 else 1.0
+
+
+def _scale_sigma(
+    problem: BundleProblem, chain: InertialChain, use: NDArray[np.bool_], variance: float
+) -> float:
     """Return the standard deviation of the logarithm of the scale of the positions of all cameras
-    (Umeyama, 1991), at the solution of a problem."""
+    (Umeyama, 1991), at the solution of a problem.
+
+    Args:
+        variance: see ``InertialChain.weighed``.
+    """
     n_free, n_points = problem.n_free, len(problem.points)
     observations = observations_of(problem, use)
     equations = empty_equations(n_free, n_points, len(problem.camera))
-    size = 6 * n_free + chain.n_unknowns
+    size, n_poses = 6 * n_free + chain.n_unknowns, 6 * n_free
     S, rhs, V_inverse = np.empty((size, size)), np.empty(size), np.empty((n_points, 3, 3))
     linearise(problem.T_cw, n_free, problem.points, observations, equations)
     reduced_system(n_free, observations, equations, 1e-9, S, rhs, V_inverse)
+    of_images = np.triu(S[:n_poses, :n_poses])
+    of_images += np.triu(of_images, 1).T
     states = start_values(problem.T_cw, chain)
     S += linear_factors(problem.T_cw, states, chain, n_free).hessian
     centre = inverses(problem.T_cw)[:, :3, 3]
     apart = centre - centre.mean(axis=0)
-    by_centre = apart / np.sum(apart**2)
-    rhs[:] = 0.0  # an increment moves the camera by -R_wc rho
-    along = rhs[: 6 * n_free].reshape(-1, 6)
-    along[:, :3] = -np.einsum("nij,nj->ni", problem.T_cw[:n_free, :3, :3], by_centre[:n_free])
+    rhs[:] = 0.0
+    rhs[:n_poses] = _moving(problem, apart / np.sum(apart**2))
     derivative = rhs.copy()
     if not cholesky_solve(S, rhs):
         return float("inf")
-    return float(np.sqrt(derivative @ rhs))
+    # How much the scale changes if the images let all later keyframes drift away from one keyframe.
+    pulled, drift = of_images @ rhs[:n_poses], 0.0
+    for k, growth in enumerate(_approach(problem, chain)):
+        away = np.zeros_like(centre)
+        later = chain.camera[k + 1 :]
+        away[later] = centre[later] - centre[chain.camera[k]]
+        drift += float(growth * (_moving(problem, away) @ pulled)) ** 2
+    return float(np.sqrt(variance * (derivative @ rhs) + _DRIFT**2 * drift))
+
+
+def _moving(problem: BundleProblem, by: Matrix) -> Matrix:
+    """Return the ``(6 n_free,)`` increments of the free cameras that move the centres of all
+    cameras by ``(K, 3)`` in the world. An increment moves a camera by ``-R_wc rho``."""
+    increments = np.zeros((problem.n_free, 6))
+    R_cw = problem.T_cw[: problem.n_free, :3, :3]
+    increments[:, :3] = -np.einsum("nij,nj->ni", R_cw, by[: problem.n_free])
+    return increments.ravel()
+
+
+def _approach(problem: BundleProblem, chain: InertialChain) -> Matrix:
+    """Return how far the camera moves forward from each keyframe of a chain to the next, divided by
+    the median depth of the landmarks that it observes."""
+    point = np.repeat(np.arange(len(problem.points)), np.diff(problem.first))
+    T = problem.T_cw[problem.camera]
+    depth = np.einsum("nj,nj->n", T[:, 2, :3], problem.points[point]) + T[:, 2, 3]
+    medians = [np.median(depth[problem.camera == k]) for k in chain.camera[:-1]]
+    T_cw = problem.T_cw[chain.camera]
+    moved = np.diff(inverses(T_cw)[:, :3, 3], axis=0)
+    forward: Matrix = np.einsum("nj,nj->n", T_cw[:-1, 2, :3], moved) / np.array(medians)
+    return forward

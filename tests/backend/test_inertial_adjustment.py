@@ -23,6 +23,7 @@ from vslam.backend.inertial_filter import noise_in_motion
 from vslam.backend.inertial_links import GRAVITY_SIGMA
 from vslam.backend.inertial_start import ACCEL_BIAS, GYRO_BIAS
 from vslam.backend.keyframe_motions import motions_between, record_motion
+from vslam.backend.metric_mapping import MapScale, scale_of_problem
 from vslam.backend.preintegration import preintegrate, so3_exp, so3_log
 from vslam.types.camera import Camera
 from vslam.types.features import Features
@@ -61,7 +62,7 @@ def samples(noise=None, seed: int = 0, rate: float = 200.0, flight: Flight = FLI
 
 def window(rows: np.ndarray, **changes) -> InertialWindow:
     state = InertialState(0.0, np.eye(4), np.zeros(3), DOWN, BIAS, np.diag(SIGMAS**2))
-    given = {one: changes.pop(one) for one in ("gravity", "bias") if one in changes}
+    given = {one: changes.pop(one) for one in ("gravity", "bias", "covariance") if one in changes}
     state = replace(state, **given)
     found = InertialWindow(rows, state, np.eye(3), T_IC, ADIS16448, 0.1)
     return replace(found, **changes)
@@ -230,6 +231,86 @@ def test_poses_are_better_with_samples():
         together.append(errors(solution.T_cw, truth))
     assert (np.array(together) < np.array(alone)).all()
     assert (np.mean(together, axis=0) < 0.8 * np.mean(alone, axis=0)).all()
+
+
+def test_weights_do_not_change_whether_samples_and_images_agree():
+    problem, _, times = scene(0)
+    made = chain(problem, times, window(samples(ADIS16448)))
+    weighed = made.weighed(3.0, 0.25)
+    inertial = start_values(problem.T_cw, made)
+    before, after = (
+        linear_factors(problem.T_cw, inertial, one, problem.n_free) for one in (made, weighed)
+    )
+    assert after.misfit == pytest.approx(before.misfit)
+    walks, motions = (made.motions.information, weighed.motions.information)
+    np.testing.assert_allclose(motions[:, :9, :9], 9.0 * 0.25 * walks[:, :9, :9])
+    np.testing.assert_allclose(motions[:, 9:, 9:], 0.25 * walks[:, 9:, 9:])
+    np.testing.assert_allclose(weighed.information, 0.25 * made.information)
+
+
+def of_one_camera(seed: int, flight: Flight) -> tuple[float, MapScale]:
+    """Find the scale of a scene whose observations err less than expected, and whose samples were
+    integrated with more noise than they have. Return the true one, too."""
+    problem, truth, times = scene(seed, n=10, flight=flight)
+    rng = np.random.default_rng([seed, 1])
+    point = np.repeat(np.arange(len(problem.points)), np.diff(problem.first))
+    exact = [
+        CAMERA.project(transform(truth[c], p[None]))[0]
+        for c, p in zip(problem.camera, problem.points[point], strict=True)
+    ]
+    uvr = np.array(exact) + 0.5 * rng.standard_normal((len(point), 3))
+    uvr[:, 2] = np.nan
+    T_cw = np.array([se3_exp(0.002 * rng.standard_normal(6)) @ T for T in truth])
+    T_cw[-1] = truth[-1]
+    centre, fixed = inverse(truth[-1])[:3, 3], 0.9
+    for T in T_cw[:-1]:
+        c = centre + fixed * (inverse(T)[:3, 3] - centre)
+        T[:3, 3] = -T[:3, :3] @ c
+    points = centre + fixed * (problem.points - centre)
+    problem = replace(problem, T_cw=T_cw, points=points, uvr=uvr)
+    seen = adjust(problem, iterations=30)
+    problem, T_cw = replace(problem, T_cw=seen.T_cw, points=seen.points), seen.T_cw
+    enlarged = replace(ADIS16448, gyro=3.0 * ADIS16448.gyro, accel=3.0 * ADIS16448.accel)
+    rows = samples(ADIS16448, seed, flight=flight)
+    unsure = np.diag(np.repeat([0.0, 0.0, 0.0, 0.5, 0.05, 0.2], 3) ** 2)
+    found = window(rows, noise=enlarged, covariance=unsure, bias=BIAS + 0.01)
+    solved = scale_of_problem(problem, chain(problem, times, found), 3.0)
+    assert solved is not None
+    spread = [np.std([inverse(T)[:3, 3] for T in poses], axis=0) for poses in (T_cw, truth)]
+    before, after = np.linalg.norm(spread, axis=1)
+    return after / before, solved
+
+
+def test_the_scale_errs_as_its_standard_deviation_tells(monkeypatch):
+    """Twenty scenes without drift: the squared errors are those of 20 normal numbers, at 98 %."""
+    monkeypatch.setattr("vslam.backend.metric_mapping._DRIFT", 0.0)
+    errors = []
+    for seed in range(20):
+        true, found = of_one_camera(seed, FLIGHT)
+        errors.append(np.log(found.scale / true) / found.sigma)
+        assert found.sigma < 0.02
+    assert 0.41 < np.mean(np.square(errors)) < 1.88
+
+
+def test_the_scale_is_less_certain_while_the_camera_approaches_the_scene():
+    """The images of a camera that comes nearer to the scene drift in scale."""
+
+    @dataclass(frozen=True)
+    class Onwards(Flight):
+        along: float = 0.0
+
+        def position(self, t) -> np.ndarray:
+            ahead = (self.rotation(1.0) @ T_IC[:3, :3])[:, 2]
+            return super().position(t) + self.along * np.asarray(t, float)[..., None] * ahead
+
+        def velocity(self, t) -> np.ndarray:
+            ahead = (self.rotation(1.0) @ T_IC[:3, :3])[:, 2]
+            return super().velocity(t) + self.along * ahead
+
+    still, onwards = (
+        of_one_camera(0, Onwards(3, turning=0.05, along=along))[1] for along in (0.0, 2.0)
+    )
+    assert onwards.sigma > 1.5 * still.sigma
 
 
 def test_samples_that_contradict_the_images_are_not_used():

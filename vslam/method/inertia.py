@@ -279,13 +279,19 @@ def _rests(before: InertialState, after: InertialState) -> bool:
 
 
 def guessed_scale(
-    inertia: Inertia, run: PoseRun, sigma: float, calibration: ImuCalibration
+    inertia: Inertia,
+    run: PoseRun,
+    sigma: float,
+    calibration: ImuCalibration,
+    *,
+    at_once: bool = False,
 ) -> tuple[Inertia, GravityState | None]:
     """Guess the scale of the map of one camera from the frames that were tracked last.
 
     Args:
         run: poses of the camera as it is mounted, in the map.
         sigma: standard deviation of these poses along each axis, in units of the map.
+        at_once: whether it is never too early to try again.
 
     Returns:
         What is known, and the most certain guess, with the state of the IMU at the last pose. None
@@ -295,7 +301,8 @@ def guessed_scale(
     if not len(times):
         return inertia, None
     now, since = float(times[-1]), float(times[0])
-    if now - inertia.tried < np.clip(RETRY_SHARE * (now - since), *SCALE_RETRY_S):
+    pause = np.clip(RETRY_SHARE * (now - since), *SCALE_RETRY_S)
+    if now - inertia.tried < pause and not at_once:
         return inertia, None
     doubted = replace(calibration, noise=noise_for_bundles(inertia, calibration))
     for seconds in SCALE_STRETCHES:

@@ -17,6 +17,7 @@ from vslam.frontend.tracking import uncertainty_of
 from vslam.method.gyro import turn_by_gyro, turn_of_start, with_turn
 from vslam.method.inertia import (
     BUNDLE_PRIOR,
+    BUNDLES,
     CARRIED_S,
     KEPT_S,
     KEPT_WITHOUT_SCALE_S,
@@ -182,11 +183,14 @@ class Motion:
         """Whether the IMU is to tell the scale of a monocular map."""
         return self._imu is not None and not self.is_metric
 
-    def guess_scale(self, view: MapView, keyframe: int) -> tuple[float, InertialWindow] | None:
+    def guess_scale(
+        self, view: MapView, keyframe: int, *, at_once: bool = False
+    ) -> tuple[float, InertialWindow] | None:
         """Guess the scale of a monocular map from the last frames and the samples.
 
         Args:
             keyframe: the first keyframe whose unit of length is that of the newest keyframe.
+            at_once: whether it is never too early to try again.
 
         Returns:
             Metres per unit of the map, and the samples with the state of the IMU in the frame of
@@ -195,7 +199,7 @@ class Motion:
         run, sigma = self._last_run(view, keyframe)
         if self._imu is None or not sigma > 0.0:
             return None
-        inertia, found = guessed_scale(self.state.inertia, run, sigma, self._imu)
+        inertia, found = guessed_scale(self.state.inertia, run, sigma, self._imu, at_once=at_once)
         self.state = replace(self.state, inertia=inertia)
         if found is None:
             return None
@@ -319,7 +323,9 @@ class Motion:
             R_odom_camera, T_imu_camera = R_odom_camera @ T[:3, :3], T_imu_camera @ T
         samples, noise = self.state.inertia.samples, noise_for_bundles(self.state.inertia, imu)
         state = replace(state, covariance=BUNDLE_PRIOR * state.covariance)
-        return InertialWindow(samples, state, R_odom_camera, T_imu_camera, noise, LONGEST_GAP)
+        return InertialWindow(
+            samples, state, R_odom_camera, T_imu_camera, noise, LONGEST_GAP, BUNDLES
+        )
 
     def turn_between(self, start: float, end: float) -> KnownTurn | None:
         """Return the rotation of the camera between two times, in seconds, as the gyroscope

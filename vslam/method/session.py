@@ -228,7 +228,9 @@ class Session:
         return self._result(self._record(replace(predicted.lost, state=state), predicted), {})
 
     def finish(self) -> None:
-        """Complete all mapping."""
+        """Complete all mapping. The scale of one camera is looked for once more."""
+        if self._mode.changes_map:
+            self._find_scale(at_once=True)
         inertial = self._motion.inertial_window() if self._mode.changes_map else None
         moved = self._mapper.finish(*self._held, inertial=inertial)
         self.last = moved[0] if moved else None
@@ -253,14 +255,18 @@ class Session:
         if waited and self.published.is_published and self._mode.changes_map:
             self._find_scale()
 
-    def _find_scale(self) -> None:
-        """Make the map metric if the last frames and the IMU tell its scale."""
+    def _find_scale(self, *, at_once: bool = False) -> None:
+        """Make the map metric if the last frames and the IMU tell its scale.
+
+        Args:
+            at_once: whether it is tried even if it was tried shortly before.
+        """
         published, motion = self.published, self._motion
         if self.last is None or not motion.seeks_scale:
             return
         moved = published.complete(self.last)
         self.last, first = moved[0], newest_unit(published.map)
-        guess = motion.guess_scale(published.view, first)
+        guess = motion.guess_scale(published.view, first, at_once=at_once)
         if guess is None:
             return
         start, inertial = guess

@@ -270,6 +270,7 @@ class InertialWindow:
         T_imu_camera: ``(4, 4)``, maps points of the tracked camera to the IMU.
         noise: of the samples, see ``noise_in_motion``.
         longest_gap: seconds between two samples above which they do not tell the motion.
+        noise_factor: by how much ``noise`` is larger than the samples show.
     """
 
     samples: Matrix
@@ -278,3 +279,4 @@ class InertialWindow:
     T_imu_camera: Matrix
     noise: ImuNoise
     longest_gap: float
+    noise_factor: float = 1.0

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from vslam.calibration.chain_adjustment import UNKNOWNS, Adjusted, Scenes
 from vslam.calibration.chains import KEYFRAMES, Chain
 from vslam.calibration.files import read_calibration
-from vslam.calibration.from_motion import MotionFit, camera_from_chains
+from vslam.calibration.from_motion import MotionFit, camera_from_chains, focal_sigma
 from vslam.calibration.models import CameraModel, project
 from vslam.support.errors import InputError
 from vslam_lab.towns import Variation, route_named
@@ -78,6 +79,43 @@ def test_focal_length_and_lens_are_found_within_the_stated_deviation(model):
     assert abs(fit.camera.fx / model.fx - 1.0) < max(3.0 * fit.sigma, 0.002)
     assert fit.sigma < 0.01
     assert fit.warnings() == []
+
+
+def adjusted(focal: np.ndarray, told: np.ndarray) -> Adjusted:
+    """Return the result of chains, each of which gives a logarithm of the focal length alone.
+
+    Args:
+        told: information of each chain.
+    """
+    information = np.zeros((len(focal), UNKNOWNS, UNKNOWNS))
+    information[:, 0, 0] = told
+    gradient = np.zeros((len(focal), UNKNOWNS))
+    gradient[:, 0] = told * (focal - np.average(focal, weights=told))
+    nothing = np.zeros(0)
+    return Adjusted(
+        PINHOLE, 0.0, Scenes(nothing, nothing, nothing), nothing, 0.0, information, gradient,
+        np.r_[0.0, np.ones(UNKNOWNS - 1)], 0.09, 0.0,
+    )  # fmt: skip
+
+
+def test_twice_the_deviation_is_the_interval_of_student_for_the_mean_of_equal_chains():
+    focal = np.array([0.01, -0.02, 0.03, 0.0])
+    sigma = focal_sigma(adjusted(focal, np.full(4, 50.0)))
+    interval = 3.182 * np.std(focal, ddof=1) / 2.0  # 0.975 of three degrees of freedom
+    assert 2.0 * sigma == pytest.approx(interval, rel=0.025)  # 1.96 counts as two
+
+
+def test_the_deviation_covers_the_truth_also_if_one_chain_tells_most():
+    rng, told, within = np.random.default_rng(0), np.array([2500.0, 400.0, 400.0, 100.0]), []
+    for _ in range(400):
+        focal = rng.normal(size=4) / np.sqrt(told)
+        sigma = focal_sigma(adjusted(focal, told))
+        within.append(abs(np.average(focal, weights=told)) <= 2.0 * sigma)
+    assert np.mean(within) > 0.93
+
+
+def test_a_single_chain_has_no_deviation():
+    assert focal_sigma(adjusted(np.zeros(1), np.ones(1))) == np.inf
 
 
 @pytest.mark.slow

@@ -91,7 +91,8 @@ class Adjusted:
             pixels.
         gradient: ``(C, 6)`` float64 gradients of the halved costs by the unknowns, after motion and
             scene are adapted. Their sum is 0.
-        prior: ``(6,)`` float64 information before the first chain.
+        prior: ``(6,)`` float64 information before the first chain, in square pixels.
+        prior_variance: of a coordinate of a corner, as assumed for the prior, in square pixels.
         variance: of one coordinate of a corner, in square pixels.
     """
 
@@ -103,6 +104,7 @@ class Adjusted:
     information: Array
     gradient: Array
     prior: Array
+    prior_variance: float
     variance: float
 
 
@@ -192,7 +194,7 @@ def adjust(
     variance = np.sum(state.weights * state.squared) / max(2 * np.count_nonzero(state.weights), 1)
     return Adjusted(
         state.camera, state.read_out, state.scenes, state.costs, state.cost, information, gradient,
-        state.prior, float(variance),
+        state.prior, (_USUAL * corners.noise) ** 2, float(variance),
     )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ from vslam.calibration.chain_adjustment import (
     begin,
 )
 from vslam.calibration.chains import KEYFRAMES, LARGEST, Chain, chains_of
-from vslam.calibration.models import Array, CameraModel, Lens, unproject
+from vslam.calibration.models import CameraModel, Lens, unproject
 from vslam.support.errors import InputError
 from vslam.types.camera import Image
 
@@ -52,6 +52,7 @@ _MOST_MINIMA, _BETTER = 3, 1e-3  # local minima that are left, and the least red
 # from one to the next. This is the variance after half of the keyframes, relative to a step.
 _DRIFT = KEYFRAMES / 2.0
 _TWO_SIGMAS = 0.975  # share of the distribution below two standard deviations
+_LITTLE = 1e-9  # relative information of the other chains, if a chain tells all
 _LEAST_KNOWN = 0.05  # largest standard deviation of the focal length, relative [own]
 _FEWEST_FOR_ZOOM = 6  # chains
 _STATED = " (from EXIF, because the motion does not tell it)"
@@ -151,7 +152,7 @@ def camera_from_chains(chains: Sequence[Chain], size: tuple[int, int], source: s
         )
     chosen = [chains[k] for k in _spread(len(chains), _MOST_CHAINS)]
     fit = _best_fit(_stacked(chosen, size), size)
-    sigma = _sigma(fit.found)
+    sigma = focal_sigma(fit.found)
     if not sigma <= _LEAST_KNOWN or _is_flat(fit, sigma):
         raise InputError(f"{source}: {_reason(fit.found)}, so the focal length is unknown; {_FIX}.")
     camera = _rounded(fit.found.camera)
@@ -256,22 +257,37 @@ def _camera(lens: Lens, view: float, size: tuple[int, int]) -> CameraModel:
     return CameraModel(focal, focal, *centre, *size, lens, (0.0,) * 4)
 
 
-def _covariance(found: Adjusted) -> Array:
-    return np.linalg.inv(found.information.sum(axis=0) + np.diag(found.prior))
+def focal_sigma(found: Adjusted) -> float:
+    """Return the relative standard deviation of the focal length, infinite for a single chain.
 
+    It is the sum of what the chains disagree by, of what the noise of the corners causes, and of
+    what is not exactly known before. Differences between chains contain that noise, too, but not
+    the errors that are common to all chains, which follow the same things in the same kind of
+    motion: counting the noise twice stands for them. [own]
 
-def _sigma(found: Adjusted) -> float:
-    """Return the relative standard deviation of the focal length: the larger of what the noise of
-    the corners causes, and of what the chains disagree by (the sandwich estimator of White,
-    "Maximum likelihood estimation of misspecified models", 1982). A few chains may agree by chance:
-    twice the result is the distance of Student's distribution within which 95 % lie."""
-    covariance, C = _covariance(found), len(found.gradient)
-    formal = _DRIFT * found.variance * covariance[LOG_FOCAL, LOG_FOCAL]
-    share = covariance[LOG_FOCAL] @ found.gradient.T
-    freedom = max(C - 1, 1)
+    The chains are left out one after the other (jackknife), because the estimate follows those that
+    tell most: cluster-robust variance CV3 of MacKinnon, Nielsen and Webb, "Cluster-robust
+    inference: a guide to empirical practice", 2023, to first order. A few chains may agree by
+    chance: twice the result is the distance of Student's distribution within which 95 % lie, with
+    the degrees of freedom of Bell and McCaffrey, "Bias reduction in standard errors for linear
+    regression with multi-stage samples", 2002.
+    """
+    H, C = found.information, len(found.gradient)
+    if C < 2:
+        return float("inf")
+    total = H.sum(axis=0) + np.diag(found.prior)
+    covariance = np.linalg.inv(total)
+    known = (found.prior_variance * found.prior) @ covariance[LOG_FOCAL] ** 2
+    formal = _DRIFT * found.variance * (covariance @ H.sum(axis=0) @ covariance)[LOG_FOCAL]
+    without = np.linalg.inv(total - H + _LITTLE * np.diag(np.diag(total)))[:, LOG_FOCAL]
+    moved = np.einsum("ca,ca->c", without, found.gradient)
+    # The covariance of the steps by which the estimate moves, if all corners had the same noise.
+    through = np.einsum("ca,cab->cb", without, H)
+    steps = np.diag(np.einsum("ca,ca->c", through, without)) - through @ covariance @ through.T
+    freedom = np.trace(steps) ** 2 / np.sum(steps**2)
     few = stdtrit(freedom, _TWO_SIGMAS) / ndtri(_TWO_SIGMAS)
-    between = few**2 * (share**2).sum() * C / freedom
-    return float(np.sqrt(max(formal, between)))
+    between = few**2 * (moved @ moved) * (C - 1) / C
+    return float(np.sqrt(between + formal[LOG_FOCAL] + known))
 
 
 def _zoom(fit: _Fit) -> float:
@@ -282,7 +298,7 @@ def _zoom(fit: _Fit) -> float:
     halves = [fit.again(part, 0.0, range(UNKNOWNS)) for part in np.array_split(np.arange(C), 2)]
     first, second = (half.camera.fx for half in halves)
     change = float(np.log(second / first))
-    sigma = float(np.linalg.norm([_sigma(half) for half in halves]))
+    sigma = float(np.linalg.norm([focal_sigma(half) for half in halves]))
     return second / first - 1.0 if abs(change) > max(_ZOOM, _ZOOM_SIGMAS * sigma) else 0.0
 
 

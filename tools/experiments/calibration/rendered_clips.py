@@ -91,7 +91,7 @@ def main() -> None:
         row: dict[str, object] = {
             "clip": f"{family}+seed:{seed}",
             "focal": round(float(model.fx), 1),
-            "k1": round(model.distortion[0], 3),
+            "k1": round(float(model.distortion[0]), 3),
         }
         begun = time.process_time()
         try:

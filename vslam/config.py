@@ -119,10 +119,11 @@ class AlignmentConfig(Section):
 class TrackingConfig(Section):
     """Frame-to-map tracking."""
 
-    method: Literal["orb", "patches"] = "patches"
+    method: Literal["auto", "orb", "patches"] = "auto"
     """`patches` searches for image patches of the landmarks (Forster et al., T-RO 2017), and
     extracts features only when a keyframe is due or too few patches are found. `orb` matches ORB
-    features in every frame. [own]"""
+    features in every frame. `auto` is `orb` for one camera without an IMU, and `patches` for all
+    others. [own]"""
     patch_min_inliers: int = Field(40, ge=10)
     """Features are extracted if fewer patches than this agree with the pose. [own]"""
     patch_min_inlier_ratio: float = Field(0.8, ge=0, le=1)

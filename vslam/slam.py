@@ -110,7 +110,7 @@ class Slam:
         config = as_config({} if config is None else config)
         if isinstance(detector, str):
             detector, images = detector_with_images(detector, config)
-        self.context = context = Context.create(camera, config)
+        self.context = context = Context.create(camera, config, has_imu=imu is not None)
         self.detector = detector
         self.workers = Workers(threads)
         self._session = Session(

@@ -287,7 +287,7 @@ def test_the_same_bytes_with_two_threads_and_after_a_resume(corridor, tmp_path):
 
 
 def test_one_camera_is_tracked_by_patches_between_keyframes(corridor):
-    slam = Slam(corridor.camera.left_camera(), Config(), "none", threads=1)
+    slam = Slam(corridor.camera.left_camera(), CONFIG, "none", threads=1)
     results = [
         slam.step(left, None, timestamp)
         for left, timestamp in zip(corridor.left, corridor.timestamps, strict=True)
@@ -303,8 +303,10 @@ def test_one_camera_is_tracked_by_patches_between_keyframes(corridor):
     assert evaluate_trajectory(slam.trajectory(), truth, "sim3").ate_rmse_m < 0.05
 
 
-def test_all_cameras_are_tracked_by_patches_unless_asked_otherwise(corridor):
+def test_one_camera_without_an_imu_is_tracked_by_features_unless_asked_otherwise(corridor):
     depth, alone = replace(corridor.camera, depth=True), corridor.camera.left_camera()
     for camera in (corridor.camera, depth, alone):
-        assert Context.create(camera, Config()).tracks_patches
-        assert not Context.create(camera, FEATURES).tracks_patches
+        assert Context.create(camera, Config()).tracks_patches == (camera is not alone)
+        assert Context.create(camera, Config(), has_imu=True).tracks_patches
+        assert Context.create(camera, CONFIG).tracks_patches
+        assert not Context.create(camera, FEATURES, has_imu=True).tracks_patches

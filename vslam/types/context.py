@@ -31,20 +31,29 @@ class Context:
 
     Attributes:
         scales: ``(levels,)`` pyramid scale factors.
+        has_imu: whether an IMU is on the camera.
     """
 
     camera: Camera
     config: Config
     scales: NDArray[np.float64]
+    has_imu: bool = False
 
     @classmethod
-    def create(cls, camera: Camera, config: Config) -> Context:
-        return cls(camera, config, scale_factors(config.orb))
+    def create(cls, camera: Camera, config: Config, *, has_imu: bool = False) -> Context:
+        return cls(camera, config, scale_factors(config.orb), has_imu)
 
     @property
     def tracks_patches(self) -> bool:
-        """Whether frames are tracked using image patches when possible."""
-        return self.config.tracking.method == "patches"
+        """Whether frames are tracked using image patches when possible.
+
+        Patches make fewer keyframes. If nothing else tells the scale of one camera, it then drifts
+        more (docs/research/performance.md).
+        """
+        method = self.config.tracking.method
+        if method == "auto":
+            return self.has_imu or not self.camera.monocular
+        return method == "patches"
 
     @property
     def aligned_certainty(self) -> int:

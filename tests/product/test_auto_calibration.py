@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from vslam.calibration.chains import KEYFRAMES, Chain
 from vslam.calibration.files import read_calibration
 from vslam.calibration.from_motion import MotionFit, camera_from_chains, focal_sigma
 from vslam.calibration.models import CameraModel, project
+from vslam.datasets.quicktime import focal_length_35_mm
 from vslam.support.errors import InputError
 from vslam_lab.towns import Variation, route_named
 from vslam_lab.towns.passes import Passes
@@ -235,3 +237,80 @@ def test_exif_tells_the_focal_length_where_the_motion_does_not(tmp_path, call):
     code, _, err = call(*words)
     assert code == 2
     assert "still: --calib auto: corners cannot be followed" in err
+
+
+def atom(kind: bytes, content: bytes) -> bytes:
+    return (8 + len(content)).to_bytes(4, "big") + kind + content
+
+
+def quicktime(kind: int, value: bytes, *, mp4: bool = False) -> bytes:
+    """Return a video without images, whose track states a focal length as the second value."""
+    names = b"com.apple.quicktime.make", b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
+    keys = bytes(4) + (2).to_bytes(4, "big") + b"".join(atom(b"mdta", name) for name in names)
+    values = (1, b"vslam"), (kind, value)
+    ilst = b"".join(
+        atom((k + 1).to_bytes(4, "big"), atom(b"data", one.to_bytes(4, "big") + bytes(4) + text))
+        for k, (one, text) in enumerate(values)
+    )
+    handler = atom(b"hdlr", bytes(8) + b"mdta" + bytes(12))
+    meta = bytes(4 if mp4 else 0) + handler + atom(b"keys", keys) + atom(b"ilst", ilst)
+    track = atom(b"trak", atom(b"tkhd", bytes(84)) + atom(b"meta", meta))
+    large = (1).to_bytes(4, "big") + b"mdat" + (16 + 5).to_bytes(8, "big") + bytes(5)
+    return atom(b"ftyp", b"qt  ") + large + atom(b"moov", atom(b"mvhd", bytes(100)) + track)
+
+
+def test_videos_state_their_focal_length_as_text_or_number(tmp_path):
+    file = tmp_path / "clip.mov"
+    for kind, value in (
+        (1, b"27"),
+        (1, b"27.00mm"),
+        (21, bytes([27])),
+        (22, bytes([0, 27])),
+        (23, struct.pack(">f", 27.0)),
+        (24, struct.pack(">d", 27.0)),
+    ):
+        for mp4 in (False, True):
+            file.write_bytes(quicktime(kind, value, mp4=mp4))
+            assert focal_length_35_mm(file) == 27.0
+
+
+def test_damaged_videos_state_no_focal_length(tmp_path):
+    file, whole = tmp_path / "clip.mov", quicktime(21, bytes([27]))
+    for n in range(len(whole)):
+        file.write_bytes(whole[:n])
+        assert focal_length_35_mm(file) is None
+    for kind, value in (
+        (1, b"wide"),
+        (1, b"nan"),
+        (1, b"-27"),
+        (1, b"\xff"),
+        (23, b"1"),
+        (99, b"1"),
+    ):
+        file.write_bytes(quicktime(kind, value))
+        assert focal_length_35_mm(file) is None
+    for at in range(len(whole)):  # must not raise, and not run on for ever
+        changed = bytearray(whole)
+        changed[at] ^= 0xFF
+        file.write_bytes(changed)
+        focal_length_35_mm(file)
+
+
+def test_a_video_tells_the_focal_length_where_the_motion_does_not(tmp_path, call):
+    file = tmp_path / "still.mp4"
+    video = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (64, 48))
+    for _ in range(6):
+        video.write(np.full((48, 64, 3), 90, np.uint8))
+    video.release()
+    whole, stated = file.read_bytes(), quicktime(21, bytes([28]))
+    stated = stated[stated.index(b"trak") - 4 :]
+    moov = whole.rindex(b"moov") - 4  # the last atom
+    size = int.from_bytes(whole[moov : moov + 4], "big")
+    assert moov + size == len(whole)
+    meta = stated[8 + 92 :]
+    file.write_bytes(whole[:moov] + atom(b"moov", whole[moov + 8 :] + meta))
+    code, out, _ = call("calibrate", file, "--auto", "--out", tmp_path / "camera.yaml")
+    assert code == 0
+    assert "standard deviation 10.0 %" in out
+    assert "from the video" in out
+    assert read_calibration([tmp_path / "camera.yaml"]).left.fx == pytest.approx(51.77, abs=0.01)

@@ -55,10 +55,23 @@ _TWO_SIGMAS = 0.975  # share of the distribution below two standard deviations
 _LITTLE = 1e-9  # relative information of the other chains, if a chain tells all
 _LEAST_KNOWN = 0.05  # largest standard deviation of the focal length, relative [own]
 _FEWEST_FOR_ZOOM = 6  # chains
-_STATED = " (from EXIF, because the motion does not tell it)"
-_STATED_SIGMA = 0.05  # of a focal length in EXIF: rounded to millimetres, and images are cropped
 _ZOOM, _ZOOM_SIGMAS = 0.05, 4.0  # relative change of the focal length that is a zoom [own]
 _ROLLING = 0.15  # read-out time in frame intervals that is a rolling shutter [own]
+
+
+@dataclass(frozen=True)
+class StatedFocalLength:
+    """The focal length that a file states.
+
+    Attributes:
+        focal: pixels.
+        sigma: its standard deviation, relative.
+        where: which data state it, such as "EXIF".
+    """
+
+    focal: float
+    sigma: float
+    where: str
 
 
 @dataclass(frozen=True)
@@ -71,10 +84,11 @@ class MotionFit:
         view: horizontal field of view in degrees.
         read_out: time between the exposure of the first and of the last row, in intervals between
             frames. 0 for a global shutter.
-        chains: number of chains of keyframes. 0 if the images state the focal length, because their
-            motion does not determine it.
+        chains: number of chains of keyframes. 0 if the focal length is the one that a file states,
+            because the motion does not determine it.
         zoomed: relative change of the focal length from the first half to the second half of the
             images; 0 if it is not significant.
+        stated_in: which data state the focal length, if the motion does not determine it.
     """
 
     camera: CameraModel
@@ -83,12 +97,14 @@ class MotionFit:
     read_out: float
     chains: int
     zoomed: float = 0.0
+    stated_in: str = ""
 
     def __str__(self) -> str:
         fisheye = ", fisheye lens" if self.camera.lens == "fisheye" else ""
+        stated = f" (from {self.stated_in}, because the motion does not tell it)"
         return (
             f"focal length {self.camera.fx:.1f} px, standard deviation {100 * self.sigma:.1f} %, "
-            f"field of view {self.view:.0f} degrees{fisheye}{'' if self.chains else _STATED}"
+            f"field of view {self.view:.0f} degrees{fisheye}{stated if self.stated_in else ''}"
         )
 
     def warnings(self) -> list[str]:
@@ -110,7 +126,7 @@ def camera_from_motion(
     images: Iterable[tuple[float, Image]],
     size: tuple[int, int],
     source: str,
-    stated: float | None = None,
+    stated: StatedFocalLength | None = None,
 ) -> MotionFit:
     """Estimate a camera from the images of a moving camera. The same images give the same camera.
 
@@ -118,8 +134,8 @@ def camera_from_motion(
         images: time in seconds and ``(H, W)`` uint8 image of each frame.
         size: width and height of the images.
         source: name of the images, for error messages.
-        stated: focal length in pixels that the images state, which is used if their motion does not
-            determine it. None if they state none.
+        stated: focal length that a file states, which is used if the motion does not determine it.
+            None if there is none.
 
     Raises:
         InputError: the motion does not determine the focal length.
@@ -130,8 +146,8 @@ def camera_from_motion(
         if stated is None:
             raise
     centre = round((size[0] - 1) / 2.0, 3), round((size[1] - 1) / 2.0, 3)
-    camera = CameraModel(stated, stated, *centre, *size)
-    return MotionFit(camera, _STATED_SIGMA, _view(camera), 0.0, 0)
+    camera = CameraModel(stated.focal, stated.focal, *centre, *size)
+    return MotionFit(camera, stated.sigma, _view(camera), 0.0, 0, stated_in=stated.where)
 
 
 def camera_from_chains(chains: Sequence[Chain], size: tuple[int, int], source: str) -> MotionFit:

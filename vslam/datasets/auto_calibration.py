@@ -4,22 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vslam.datasets.frames import RawSource, Size
+from vslam.datasets.quicktime import focal_length_35_mm
 from vslam.support.errors import BrokenSourceError, InputError, UnreadableImageError
 from vslam.types.camera import Image
 from vslam.types.source_options import SourceOptions
 
 if TYPE_CHECKING:
-    from vslam.calibration.from_motion import MotionFit
+    from vslam.calibration.from_motion import MotionFit, StatedFocalLength
 
 SECONDS = 60.0
 """Length of the beginning of a recording that is used."""
 
 _EXIF, _FOCAL_LENGTH_35_MM = 0x8769, 0xA405  # tags of EXIF 2.32
+# Relative standard deviations of what files state: it is rounded to millimetres, and images are
+# cropped; those of videos are often cropped further, to hide that the camera shakes. [own]
+_EXIF_SIGMA, _VIDEO_SIGMA = 0.05, 0.1
 _CALIBRATED = ("images", "video", "bag")
 
 
@@ -64,22 +69,31 @@ def calibrate_source(raw: RawSource, data: str) -> MotionFit:
     from vslam.calibration.from_motion import camera_from_motion
 
     size, name = raw.sizes[0], f"{data}: --calib auto"
-    return camera_from_motion(_images(raw), size, name, _stated_focal_length(raw, size))
+    return camera_from_motion(_images(raw), size, name, _stated(raw, data, size))
 
 
-def _stated_focal_length(raw: RawSource, size: Size) -> float | None:
-    """Return the focal length in pixels that EXIF states for the first image, as the equivalent for
-    a film of 36x24 mm with the same diagonal (CIPA DCG-001). None if there is none."""
+def _stated(raw: RawSource, data: str, size: Size) -> StatedFocalLength | None:
+    """Return the focal length that EXIF states for the first image, or that a video states, as the
+    equivalent for a film of 36x24 mm with the same diagonal (CIPA DCG-001). None if there is none.
+    """
+    from vslam.calibration.from_motion import StatedFocalLength
+
     file = raw.stored[0].file if raw.stored else None
-    if file is None:
+    equivalent: float | None = None
+    with suppress(Exception):  # many kinds of errors
+        equivalent = focal_length_35_mm(Path(data)) if file is None else _of_exif(file)
+    focal = (equivalent or 0.0) / float(np.hypot(36.0, 24.0)) * float(np.hypot(*size))
+    if not 0.0 < focal < float("inf"):
         return None
+    where, sigma = ("the video", _VIDEO_SIGMA) if file is None else ("EXIF", _EXIF_SIGMA)
+    return StatedFocalLength(round(focal, 3), sigma, where)
+
+
+def _of_exif(file: Path) -> float:
     from PIL import Image as PillowImage
 
-    with suppress(Exception), PillowImage.open(file) as image:  # many kinds of errors
-        equivalent = float(image.getexif().get_ifd(_EXIF).get(_FOCAL_LENGTH_35_MM, 0))
-        focal = equivalent / float(np.hypot(36.0, 24.0)) * float(np.hypot(*size))
-        return round(focal, 3) if 0.0 < focal < float("inf") else None
-    return None
+    with PillowImage.open(file) as image:
+        return float(image.getexif().get_ifd(_EXIF).get(_FOCAL_LENGTH_35_MM, 0))
 
 
 def _images(raw: RawSource) -> Iterator[tuple[float, Image]]:

@@ -401,7 +401,7 @@ def refine(
     confirmed = local.confirms(track.landmark[matched])
     T_found, inlier = optimise_pose(
         T_cw,
-        *_observed_points(track, matched, context),
+        *observed_points(track, matched, context),
         trusted=trusted_landmarks(confirmed, track.xyz[matched], T_cw, context),
         confirmed=confirmed,
     )
@@ -450,14 +450,14 @@ def uncertainty_of(
         None if ``offset_sigma`` is 0.
     """
     matched = np.flatnonzero(np.isfinite(track.xyz[:, 0]))
-    observed = _observed_points(track, matched, context)
+    observed = observed_points(track, matched, context)
     covariance, effect = pose_covariance(track.T_cw, *observed), None
     if offset_sigma > 0.0:
         effect = offset_sigma * offset_effect(track.T_cw, *observed[:4])
     return covariance, effect
 
 
-def _observed_points(
+def observed_points(
     track: Track, matched: NDArray[np.integer], context: Context
 ) -> tuple[NDArray[np.float64], ...]:
     """Return the arguments of ``optimise_pose`` that follow ``T_cw``, for the points that the

@@ -211,6 +211,7 @@ def map_file(folder: Path) -> None:
         Checkpoint,
         ClosingState,
         ConsistencyState,
+        FrameObservations,
         MotionState,
         PolicyState,
         PublishedState,
@@ -250,12 +251,22 @@ def map_file(folder: Path) -> None:
         patches.pixels[2:],
         patches.shift[2:],
     )
+    recent = FrameObservations(
+        1,
+        2,
+        0,
+        np.eye(4),
+        1.0,
+        ids[2:].astype(np.int32),
+        features.xy[2:],
+        np.ones(n - 2, np.float32),
+    )
     last = Track(2, 0.2, np.eye(4), twist=np.zeros(6)).with_features(Extracted(features))
     last = last.matching(np.arange(n), ids.astype(np.int32), map_.arrays.xyz[ids])
     checkpoint = Checkpoint(
         last,
         MotionState(),
-        PublishedState(2, 2, 0.2, (patches,), known_place),
+        PublishedState(2, 2, 0.2, (patches,), known_place, (recent,)),
         PolicyState(100.0, False),
         ClosingState(ConsistencyState((ResembledPlace(frozenset((0,)), 1),), ((3, waits),), 3)),
     )

@@ -452,6 +452,15 @@ def entry(part: str, **fields: object):
     return pytest.param(apply, id=next(iter(fields)))
 
 
+def recent(field: str, value: object):
+    def apply(file: Path, to: Path) -> Path:
+        header = header_of(file)
+        header["checkpoint"]["state"]["published"]["recent"][0][field] = value
+        return changed(file, to, header=as_header(header))
+
+    return pytest.param(apply, id=f"{field} {value}")
+
+
 def without_checkpoint(file: Path, to: Path) -> Path:
     return changed(file, to, header=as_header(header_of(file) | {"checkpoint": None}))
 
@@ -545,6 +554,28 @@ def test_the_patches_of_a_known_place_come_back(at_known_place, tmp_path):
     ],
 )
 def test_damaged_patches_of_a_known_place_are_refused(apply, at_known_place, tmp_path):
+    assert "damaged" in refusal(apply(at_known_place, tmp_path / "hand.npz"))
+
+
+RECENT = "checkpoint.published.recent.0"
+
+
+@pytest.mark.parametrize(
+    "apply",
+    [
+        damage(f"{RECENT}.landmark", (0,), 10**6),
+        damage(f"{RECENT}.landmark", (0,), -2),
+        damage(f"{RECENT}.xy", (3, 0), np.nan),
+        damage(f"{RECENT}.sigma", (3,), 0.0),
+        damage(f"{RECENT}.T_c_keyframe", (0, 0), np.inf),
+        recent("index", 3),
+        recent("index", -1),
+        recent("keyframe", 3),
+        recent("keyframe", -1),
+        recent("unit_scale", 0.0),
+    ],
+)
+def test_damaged_observations_of_a_recent_frame_are_refused(apply, at_known_place, tmp_path):
     assert "damaged" in refusal(apply(at_known_place, tmp_path / "hand.npz"))
 
 

@@ -18,6 +18,7 @@ from vslam.types.trajectory import Trajectory
 LEFT_CAMERA = CAMERA.left_camera()
 RING = Ring.create()
 ROUND = [float(k) for k in range(LAP + 40)]
+IMAGE = np.zeros((1, 1), np.uint8)
 
 
 def see(k):
@@ -86,6 +87,25 @@ def test_the_first_landmarks_make_the_unit():
         slam.context.config.initialization.median_depth, rel=0.2
     )
     assert second >= 1
+
+
+def test_a_drive_that_is_resumed_has_the_bytes_of_one_that_was_not(tmp_path):
+    """Also the frames whose poses are found again later (``RecentFrames``)."""
+    whole, _ = run(ROUND[:60])
+    slam, done = Slam(LEFT_CAMERA, None, "none", threads=1), 0
+    for done, k in enumerate(ROUND[:60], 1):
+        slam.step_features(Extracted(see(k)), 0.1 * (done - 1), IMAGE)
+        state = slam.stored_map().checkpoint
+        if done > 30 and state is not None and len(state.published.recent) > 5:
+            break
+    assert done < 50
+    slam.save(tmp_path / "part.npz", resumable=True)
+    again = Slam.load(tmp_path / "part.npz", detector="none", threads=1, resume=True)
+    for one in (slam, again):
+        for i, k in enumerate(ROUND[done:60], done):
+            one.step_features(Extracted(see(k)), 0.1 * i, IMAGE)
+        one.finish()
+        assert one.trajectory().T_wc.tobytes() == whole.trajectory().T_wc.tobytes()
 
 
 @pytest.mark.slow

@@ -68,7 +68,7 @@ LEVELS: tuple[tuple[str, ...], ...] = (
     ("vslam.method.gyro",),
     ("vslam.method.hypotheses", "vslam.method.inertia"),
     ("vslam.method.starter", "vslam.method.closing", "vslam.method.motion"),
-    ("vslam.method.map_frames", "vslam.method.gaps"),
+    ("vslam.method.map_frames", "vslam.method.gaps", "vslam.method.recent_frames"),
     ("vslam.method.published_map", "vslam.method.joining"),
     ("vslam.method.mapping",),
     ("vslam.method.modes",),

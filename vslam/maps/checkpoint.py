@@ -14,7 +14,7 @@ from vslam.types.map import Map
 from vslam.types.states import Checkpoint, PublishedState
 from vslam.types.track import Track
 
-SCHEMA = 7
+SCHEMA = 8
 _MOST = 1e12  # metres, pixels or seconds
 LOOP_SHAPES = {
     "LoopEdge.T_query_match": (4, 4),
@@ -55,6 +55,10 @@ CHECKPOINTS = Codec(
         "FramePatches.angle": ("N",),
         "FramePatches.pixels": ("N", PATCH_PIXELS),
         "FramePatches.shift": ("N", 2),
+        "FrameObservations.T_c_keyframe": (4, 4),
+        "FrameObservations.landmark": ("N",),
+        "FrameObservations.xy": ("N", 2),
+        "FrameObservations.sigma": ("N",),
         "OdometryState.T_odom_camera": (4, 4),
         "PoseUncertainty.local": (6, 6),
         "PoseUncertainty.drift": (6, 6),
@@ -104,6 +108,7 @@ def checked_checkpoint(
         "the last frame": _is_last_frame(checkpoint.last, map_, n_frames),
         "the last keyframe": _is_last_keyframe(checkpoint.published, map_, n_frames),
         "the patches": _are_patches(checkpoint.published, map_, n_frames),
+        "a recent frame": _are_recent(checkpoint.published, map_, n_frames),
         "a verified loop": _are_ids(ends, map_.n_keyframes)
         and all(edge.T_query_match is not None and edge.scale > 1 / _MOST for edge in edges),
         "a resembled place": all(
@@ -153,6 +158,17 @@ def _are_patches(published: PublishedState, map_: Map, n_frames: int) -> bool:
             and _are_ids(place.landmark, map_.n_landmarks)
             and _are_ids(place.octave, len(map_.scales))
         )
+    )
+
+
+def _are_recent(published: PublishedState, map_: Map, n_frames: int) -> bool:
+    return all(
+        0 <= one.index < n_frames
+        and 0 <= one.keyframe < map_.n_keyframes
+        and one.unit_scale > 1 / _MOST
+        and _are_ids(one.landmark, map_.n_landmarks, least=-1)
+        and bool((one.sigma > 1 / _MOST).all())
+        for one in published.recent
     )
 
 

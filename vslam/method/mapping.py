@@ -212,7 +212,10 @@ class Mapper:
             self._closing.finish(map_)
             if inertial is not None:
                 self._adjust_widely(map_, inertial)
-        return self.published.renew_view(*tracks) if map_.n_keyframes else tracks
+        if map_.n_keyframes:
+            tracks = self.published.renew_view(*tracks)
+            self.published.conclude()
+        return tracks
 
     def _make_room(self, map_: Map, track: Track) -> Track:
         """Drop culled landmarks if there are many, unless a global bundle adjustment is running.
@@ -222,6 +225,7 @@ class Mapper:
         if self._closing.is_adjusting or not map_.many_culled_landmarks:
             return track
         new_id, landmark = map_.drop_culled_landmarks(), track.landmark.copy()
+        self.published.renumber(new_id)
         landmark[track.landmark >= 0] = new_id[track.tracked]
         return replace(track, landmark=landmark)
 

@@ -155,7 +155,7 @@ class Building:
             return track
         first, second = self._mapper.begin(start)
         for found in track_waiting(start, first, second, self._published.view, self._tracker):
-            self._published.frames.find(found.index, found.T_cw, beside=first.index)
+            self._published.find(found, beside=first.index)
         self.starter.reset()
         self.policy.reference_renewed()
         return second
@@ -174,6 +174,7 @@ class Building:
             return track
         self.starter.reset()
         self._published.count(track)
+        self._published.keep(track)
         evidence = self.policy.observe(
             track,
             self._published.view,

@@ -16,6 +16,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vslam.backend.disparity_offset import offset_sigma
 from vslam.frontend.patch_tracking import stride_of
@@ -23,6 +24,7 @@ from vslam.frontend.patches import RecentPatches, patches_of_frame, patches_of_l
 from vslam.method.closing import LoopClosing, LoopSearch
 from vslam.method.hypotheses import part_of
 from vslam.method.map_frames import LandmarkCounts, MapChange, count_shared_landmarks
+from vslam.method.recent_frames import RecentFrames
 from vslam.method.shared_map import SharedMap
 from vslam.support.workers import Job, Workers
 from vslam.types.context import Context
@@ -81,6 +83,7 @@ class PublishedMap:
         self._search: Job[LoopSearch] | None = None
         self._counts = LandmarkCounts()
         self.frames = FramePoses(self, frames)
+        self._recent = RecentFrames(context, self.frames)
         if state is None and self.map.n_keyframes:
             state = _state_at(int(self.map.living_keyframes()[-1]), self.map, self.frames)
         if state is not None:
@@ -88,6 +91,7 @@ class PublishedMap:
             for patches in state.patches:
                 self._patches.add(patches)
             self._known_place = state.known_place
+            self._recent = RecentFrames(context, self.frames, state.recent)
             self.refer_to(state.reference)
 
     # What may be read at any time
@@ -154,6 +158,7 @@ class PublishedMap:
         self._wait_for_mapping()
         self.is_published = True
         tracks = self.renew_view(*tracks)
+        self._recent.settle(self.map)
         self._start_search()
         return tracks
 
@@ -229,6 +234,25 @@ class PublishedMap:
         """Count the landmarks that a frame should have seen, and those that it found."""
         self._counts.add(track.visible, track.tracked)
 
+    def keep(self, track: Track) -> None:
+        """Keep what a recorded frame of a monocular camera observed, so that its pose is found
+        again when the map has been adjusted."""
+        if self._context.camera.monocular:
+            self._recent.add(track, self.n_keyframes)
+
+    def find(self, track: Track, *, beside: int) -> None:
+        """Record the pose of an earlier frame, which was tracked only now (``FramePoses.find``)."""
+        self.frames.find(track.index, track.T_cw, beside=beside)
+        self.keep(track)
+
+    def renumber(self, new_id: NDArray[np.int32]) -> None:
+        """Replace the ids of landmarks after ``Map.drop_culled_landmarks``."""
+        self._recent.renumber(new_id)
+
+    def conclude(self) -> None:
+        """Find the final poses of the frames at the end of a drive."""
+        self._recent.conclude(self.map)
+
     # The reference keyframe, which is not part of the map
 
     def refer_to(self, keyframe: int) -> None:
@@ -255,6 +279,7 @@ class PublishedMap:
         self.last_frame, self.last_timestamp = track.index, track.timestamp
         self.refer_to(keyframe)
         self.frames.replace(track.index, keyframe)
+        self._recent.forget(track.index)
 
     def refer_to_known(self, keyframe: int, track: Track) -> None:
         """Make the old keyframe of a known place the reference keyframe of a frame."""
@@ -278,6 +303,7 @@ class PublishedMap:
             self.last_timestamp,
             self._patches.all(),
             self._known_place,
+            self._recent.all(),
         )
 
 

@@ -65,6 +65,19 @@ class FrameTable(NamedTuple):
         return FrameTable._make(values[:frames] for values in self)
 
 
+class RelativePose(NamedTuple):
+    """The pose of a frame relative to a keyframe.
+
+    Attributes:
+        keyframe: id of the keyframe.
+        T_c_keyframe, unit_scale: see ``FrameTable``.
+    """
+
+    keyframe: int
+    T_c_keyframe: Matrix
+    unit_scale: float
+
+
 class PoseRun(NamedTuple):
     """The poses of N frames that were tracked one after the other.
 
@@ -181,14 +194,26 @@ class FramePoses:
 
         Index -1 is the last frame.
         """
-        index = self._number(index)
-        T_c_reference = self._frames.T_c_reference[index].copy()
+        return self.in_map(*self.relative(index))
+
+    def relative(self, index: int) -> RelativePose:
+        """Return the pose of a frame relative to its keyframe."""
+        index, frames = self._number(index), self._frames
+        return RelativePose(
+            int(frames.reference[index]),
+            frames.T_c_reference[index].copy(),
+            float(frames.unit_scale[index]),
+        )
+
+    def in_map(self, keyframe: int, T_c_keyframe: Matrix, unit_scale: float) -> Matrix:
+        """Compute the pose ``T_cw`` of a frame from its ``RelativePose``."""
         if self._keyframes.n_keyframes == 0:
-            return T_c_reference
-        T_kw, unit = self._keyframes.keyframe(int(self._frames.reference[index]))
-        if unit != self._frames.unit_scale[index]:
-            T_c_reference[:3, 3] *= unit / self._frames.unit_scale[index]
-        return T_c_reference @ T_kw
+            return T_c_keyframe
+        T_kw, unit = self._keyframes.keyframe(keyframe)
+        if unit != unit_scale:
+            T_c_keyframe = T_c_keyframe.copy()
+            T_c_keyframe[:3, 3] *= unit / unit_scale
+        return T_c_keyframe @ T_kw
 
     def last_run(self, seconds: float, keyframe: int) -> PoseRun:
         """Return the poses of the frames that were tracked last, up to the newest frame, without a

@@ -7,9 +7,13 @@ the results of an uninterrupted run.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from vslam.types.features import FramePatches, KeyframePatches
+from vslam.types.geometry import Matrix
 from vslam.types.imu import Inertia
 from vslam.types.loops import LoopEdge, ResembledPlace
 from vslam.types.odometry import OdometryState
@@ -32,6 +36,34 @@ class MotionState:
 
 
 @dataclass(frozen=True)
+class FrameObservations:
+    """What a frame of a monocular camera observed, from which its pose is found again when the map
+    has been adjusted.
+
+    Attributes:
+        index: index of the frame.
+        n_keyframes: number of keyframes of the map when the frame was tracked.
+        keyframe, T_c_keyframe, unit_scale: the pose as it was tracked (``RelativePose``).
+        landmark: ``(N,)`` int32 ids of the landmarks; -1 if culled.
+        xy: ``(N, 2)`` float32 positions where they were observed, in pixels.
+        sigma: ``(N,)`` float32 standard deviations of these positions, in pixels.
+    """
+
+    index: int
+    n_keyframes: int
+    keyframe: int
+    T_c_keyframe: Matrix
+    unit_scale: float
+    landmark: NDArray[np.int32]
+    xy: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+
+    def observing(self, landmark: NDArray[np.int32]) -> FrameObservations:
+        """Return the observations with ``(N,)`` new ids of the landmarks."""
+        return replace(self, landmark=landmark.astype(np.int32))
+
+
+@dataclass(frozen=True)
 class PublishedState:
     """State of the published map, apart from the map.
 
@@ -43,6 +75,7 @@ class PublishedState:
         patches: image patches of the newest keyframes, oldest first.
         known_place: image patches of the last frame at which an existing keyframe was used instead
             of inserting a new one; None if a keyframe has been inserted since then.
+        recent: what the newest frames of a monocular camera observed, in the order of time.
     """
 
     reference: int
@@ -50,6 +83,7 @@ class PublishedState:
     last_timestamp: float = -math.inf
     patches: tuple[KeyframePatches, ...] = ()
     known_place: FramePatches | None = None
+    recent: tuple[FrameObservations, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,18 @@ def test_a_frame_whose_landmarks_disagree_keeps_the_pose_that_was_tracked():
     np.testing.assert_allclose(recent.settle(), T_TRACKED, atol=1e-12)
 
 
+def test_wrong_matches_that_tracking_would_accept_do_not_pull_at_the_pose():
+    """A third of the landmarks is seen two standard deviations aside."""
+    recent = Recent(0)
+    for _ in range(2):
+        recent.add_keyframe()
+    track = recent.track(1)
+    features = track.features
+    features.xy[::3, 0] += 2.0
+    recent.frames.add(track, 1)
+    assert error(recent.settle()) < 1e-4
+
+
 def test_a_frame_whose_landmarks_were_culled_keeps_the_pose_that_was_tracked():
     recent = Recent()
     for _ in range(2):

@@ -256,18 +256,20 @@ def edge_sigmas(
 def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     """Find the connected part of the graph that each of ``n`` nodes belongs to. Returns ``(n,)``
     int64, the index of the first node of the part."""
-    part = list(range(n))
+    above: dict[int, int] = {}  # of the nodes with edges; without an entry, a node is the first
 
     def first_of(node: int) -> int:
-        while part[node] != node:
-            part[node] = part[part[node]]
-            node = part[node]
+        while (up := above.get(node, node)) != node:
+            above[node] = node = above.get(up, up)
         return node
 
     for i, j in edges.tolist():
         first, second = sorted((first_of(i), first_of(j)))
-        part[second] = first
-    return np.array([first_of(node) for node in range(n)], np.int64)
+        above[second] = first
+    part = np.arange(n)
+    for node in above:
+        part[node] = first_of(node)
+    return part
 
 
 def optimise(graph: PoseGraph, config: PoseGraphConfig) -> NDArray[np.float64]:

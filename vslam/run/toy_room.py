@@ -28,6 +28,7 @@ from vslam.run.warmup import record_file
 from vslam.slam import Slam
 from vslam.types.camera import Camera, Image
 from vslam.types.imu import GRAVITY, ImuCalibration
+from vslam.types.map import Map
 
 CAMERA = Camera(160.0, 160.0, 160.0, 120.0, 0.1, 320, 240)
 WALL, CIRCLE = 2.0, 0.5  # radii of the room and of the circle, in metres
@@ -101,7 +102,7 @@ def view(x: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np
 
 
 def call_rare_kernels() -> None:
-    """Call the kernels for learned descriptors, moving objects and PNG files."""
+    """Call the kernels for learned descriptors, moving objects, sub-maps and PNG files."""
     rng = np.random.default_rng(0)
     coarse, fine = (rng.standard_normal((rows, 2 * rows, 4), np.float32) for rows in (4, 16))
     maps, xy = DescriptorMaps(coarse, fine, 1.0), np.full((2, 2), 20.0, np.float32)
@@ -114,6 +115,7 @@ def call_rare_kernels() -> None:
     weights = np.ones(len(points))
     optimise_pose(np.eye(4), points, uvr, weights, CAMERA.intrinsics, trusted=trusted)
 
+    Map(np.ones(1)).submaps()
     unfilter(np.zeros((2, 5), np.uint8), np.empty((2, 4), np.uint8))
 
 

@@ -28,7 +28,12 @@ from vslam.types.features import Features
 from vslam.types.geometry import adjoint, compose, inverse, orthonormalised
 from vslam.types.imu import GravityDirection
 from vslam.types.loops import LoopEdge
-from vslam.types.map_kernels import count_shared, detach_keyframe, resolve
+from vslam.types.map_kernels import (
+    count_shared,
+    detach_keyframe,
+    first_of_submaps,
+    resolve,
+)
 from vslam.types.revisits import Revisits
 
 NONE = -1
@@ -459,11 +464,8 @@ class Map:
 
         A sub-map is identified by the id of its first keyframe.
         """
-        root = np.zeros(self.n_keyframes, np.int64)
-        restart, parents = self.keyframes.restart.tolist(), self.parents.tolist()
-        for keyframe in range(1, self.n_keyframes):
-            root[keyframe] = keyframe if restart[keyframe] else root[parents[keyframe]]
-        return root
+        restart = self.keyframes.restart[: self.n_keyframes]
+        return np.asarray(first_of_submaps(restart, self.parents))
 
     def living_keyframes(self) -> NDArray[np.int64]:
         """Return the ids of the keyframes that have not been culled."""

@@ -109,6 +109,20 @@ def cut_path(a, keyframe, n_keyframes):
 
 
 @kernel
+def first_of_submaps(restart, parents):
+    """Return the first keyframe of the sub-map of each keyframe, ``(K,)`` int64.
+
+    Args:
+        restart: ``(K,)``, not 0 where a keyframe begins a sub-map.
+        parents: ``(K,)`` parents in the spanning tree.
+    """
+    first = np.zeros(len(parents), np.int64)
+    for keyframe in range(1, len(parents)):
+        first[keyframe] = keyframe if restart[keyframe] else first[parents[keyframe]]
+    return first
+
+
+@kernel
 def observed_by(a, landmark, keyframe):
     """Return the index in ``Arrays`` of a keyframe's keypoint that observes a landmark, or -1."""
     row = a.head[landmark]

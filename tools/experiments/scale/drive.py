@@ -211,7 +211,7 @@ def row(part: str, slam: Slam, times: list[float], lost: int) -> dict[str, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--keyframes", type=int, default=10000, help="before the loop")
-    parser.add_argument("--frames-per-keyframe", type=float, default=1.8, help="to plan the drive")
+    parser.add_argument("--frames-per-keyframe", type=float, default=1.43, help="on straight roads")
     parser.add_argument("--part", type=int, default=1000, help="frames of a row")
     parser.add_argument("--detector", default="bow")
     parser.add_argument("--out", type=Path, required=True)

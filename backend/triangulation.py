@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.support.kernels import hamming, inner_kernel, kernel
+from vslam.support.kernels import inner_kernel, kernel, popcount
 from vslam.types.context import Context
 from vslam.types.geometry import inverse, transform
 from vslam.types.map import NONE, Map
@@ -139,6 +139,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
         t[i] = T2[i, 0] * gap[0] + T2[i, 1] * gap[1] + T2[i, 2] * gap[2]
     x2, y2 = np.empty(n2, np.float32), np.empty(n2, np.float32)
     gate = np.empty(n2, np.float32)
+    descriptor_2 = a.descriptor[rows_2]
     for j in range(n2):
         x2[j], y2[j] = a.xy[rows_2[j], 0], a.xy[rows_2[j], 1]
         gate[j] = EPIPOLAR_CHI2 * scales[a.octave[rows_2[j]]] ** 2
@@ -161,6 +162,7 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
         p, q = np.float32(l_x / norm), np.float32(l_y / norm)
         s = np.float32((n_z - l_x * cx - l_y * cy) / norm)
         stereo_1 = not np.isnan(a.u_right[row_1])
+        d_0, d_1, d_2, d_3 = a.descriptor[row_1]
         best, best_distance = -1, max_distance + 1
         along = direction(dot3(d, across[0]), dot3(d, across[1]))
         section = int(along * (0.5 * SECTIONS)) % SECTIONS
@@ -168,7 +170,11 @@ def triangulate_pair(a, k1, k2, intrinsics, scales, min_baseline, max_distance, 
             off = p * x2[j] + q * y2[j] + s
             if off * off >= gate[j] or taken[j]:
                 continue
-            distance = hamming(a.descriptor[row_1], a.descriptor[rows_2[j]])
+            # Half of the bits suffice to refuse most candidates.
+            distance = popcount(d_0 ^ descriptor_2[j, 0]) + popcount(d_1 ^ descriptor_2[j, 1])
+            if distance >= best_distance:
+                continue
+            distance += popcount(d_2 ^ descriptor_2[j, 2]) + popcount(d_3 ^ descriptor_2[j, 3])
             if distance >= best_distance:
                 continue
             if not stereo_1 and np.isnan(a.u_right[rows_2[j]]) and t[2] > 0.0:

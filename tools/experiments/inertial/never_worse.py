@@ -67,8 +67,9 @@ def main() -> None:
             for system, imu, _ in settings:
                 run = SYSTEMS[system](drive, imu=imu)
                 rows.append({
-                    "route": name, "drive": f"{name}, seed {seed}", "sensor": sensor,
-                    "system": system, "imu": "yes" if imu else "no", **measured(run, drive, route),
+                    "route": name, "seed": seed, "drive": f"{name}, seed {seed}",
+                    "sensor": sensor, "system": system, "imu": "yes" if imu else "no",
+                    **measured(run, drive, route),
                 })  # fmt: skip
                 print(rows[-1], flush=True)
     write_rows(options.out, rows)

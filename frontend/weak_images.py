@@ -187,8 +187,8 @@ def with_contrast(image: Grey) -> Grey:
     """Normalise the local contrast of an ``(H, W)`` uint8 image.
 
     The image is blurred by one pixel. Then the grey values are scaled so that the window around
-    every pixel has the same standard deviation. Flat regions, which contain
-    only noise, are amplified less.
+    every pixel has the same standard deviation. Flat regions, which contain only noise, are
+    amplified less.
     """
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
     window = (_CONTRAST_WINDOW, _CONTRAST_WINDOW)

@@ -117,7 +117,7 @@ class RecentFrames:
         is the first guess, and is used if too few landmarks agree."""
         T_cw = self._poses.in_map(frame.keyframe, frame.T_c_keyframe, frame.unit_scale)
         found = _optimised(frame, T_cw, map_, self._context)
-        reference = self._poses.relative(frame.index)[0]
+        reference = self._poses.relative(frame.index).keyframe
         self._poses.follow(frame.index, reference, T_cw if found is None else found)
 
 

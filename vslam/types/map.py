@@ -28,12 +28,7 @@ from vslam.types.features import Features
 from vslam.types.geometry import adjoint, compose, inverse, orthonormalised
 from vslam.types.imu import GravityDirection
 from vslam.types.loops import LoopEdge
-from vslam.types.map_kernels import (
-    count_shared,
-    detach_keyframe,
-    first_of_submaps,
-    resolve,
-)
+from vslam.types.map_kernels import count_shared, detach_keyframe, first_of_submaps, resolve
 from vslam.types.revisits import Revisits
 
 NONE = -1

@@ -10,13 +10,21 @@ camera, because one motion must explain how both near and far points move in the
 the offset becomes an additional unknown of bundle adjustment that is common to all keyframes
 (self-calibration: Triggs et al., "Bundle adjustment - a modern synthesis", section 10).
 
-The offset is estimated in disjoint windows of keyframes. The estimates are weighted by their
-information (inverse variance) and combined with a prior of mean 0.
+The offset is estimated in disjoint windows of keyframes, whose estimates are weighted by their
+information (inverse variance). A patch across the edge of an object takes over the larger disparity
+of the object, so the errors of small disparities are skewed. The estimate therefore uses only the
+disparities that agree best with the motion.
+
+Most rectified pairs have no offset that matters, and to correct one that is not there makes the map
+as wrong as not to correct one that is. Therefore, the prior gives the same probability to no offset
+and to a normally distributed one (Mitchell and Beauchamp, "Bayesian variable selection in linear
+regression", 1988). The posterior mean is added to the disparities.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from math import exp, sqrt
 
 import numpy as np
 
@@ -26,12 +34,14 @@ from vslam.config import StereoConfig
 from vslam.types.context import Context
 from vslam.types.features import shifted_columns
 from vslam.types.imu import InertialWindow
-from vslam.types.map import Map
+from vslam.types.map import Map, Scalars
 from vslam.types.map_kernels import collect_landmarks
 
 # The offset is estimated again after this many keyframes. [own]
 _OFFSET_KEYFRAMES = 12
 
+TRIM = 2.0  # standard deviations about the median, within which disparities are used
+DEVIATION_OF_MEDIAN = 1.4826  # normal standard deviations per median deviation
 STEP = 0.2  # pixels between the three offsets for which the cost is computed
 ITERATIONS = 15
 # Variance of the error of the estimate, in multiples of the inverse of its information. It is not
@@ -63,33 +73,53 @@ def _calibrate(map_: Map, keyframe: int, context: Context, inertial: InertialWin
     found, information = remaining_offset(problem)
     if information <= 0.0:
         return
-    prior = config.offset_sigma**-2.0
-    total = known.offset_information + information
-    change = found * information / (prior + total)
-    map_.scalars = replace(
-        map_.scalars,
-        disparity_offset=known.disparity_offset + change,
-        offset_information=total,
-    )
+    map_.scalars = found_offset(map_.scalars, known.disparity_offset + found, information, config)
     a, n = map_.arrays, map_.n_rows
+    change = map_.scalars.disparity_offset - known.disparity_offset
     a.u_right[:n] = shifted_columns(a.u_right[:n], a.xy[:n, 0], change)
     adjust_locally(map_, keyframe, context, inertial)
 
 
-def offset_sigma(information: float, config: StereoConfig) -> float:
-    """Compute the standard deviation of the disparity offset, in pixels, that is caused by the
-    noise of the measurements.
-
-    The prior of mean 0 makes the estimated offset smaller than the true offset. The result does not
-    include this error.
+def found_offset(known: Scalars, found: float, information: float, config: StereoConfig) -> Scalars:
+    """Add the estimate of one window to what is known of the disparity offset.
 
     Args:
-        information: see ``Scalars.offset_information``.
+        found: the offset of all measured disparities in the window, in pixels.
+        information: see ``remaining_offset``.
     """
-    if information <= 0.0:
-        return 0.0
-    prior = config.offset_sigma**-2.0 if config.offset_sigma > 0.0 else 0.0
-    return float(np.sqrt(VARIANCE * information) / (prior + information))
+    n, total = known.offset_windows + 1, known.offset_information + information
+    step = found - known.offset_mean
+    mean = known.offset_mean + step * information / total
+    scatter = known.offset_scatter + step**2 * known.offset_information * information / total
+    # Windows that differ by more than their information says have errors of their own (Birge, "The
+    # calculation of errors by the method of least squares", 1932).
+    variance = max(VARIANCE, (VARIANCE + scatter) / n) / total
+    offset, sigma = posterior_offset(mean, variance, config.offset_sigma**2)
+    return replace(
+        known,
+        disparity_offset=offset,
+        offset_sigma=sigma,
+        offset_mean=mean,
+        offset_information=total,
+        offset_scatter=scatter,
+        offset_windows=n,
+    )
+
+
+def posterior_offset(mean: float, variance: float, prior: float) -> tuple[float, float]:
+    """Compute the posterior mean and the standard deviation of the offset. A priori, the offset is
+    zero with a probability of one half, and else it is normally distributed with mean 0.
+
+    Args:
+        mean, variance: of the estimate, in pixels and squared pixels.
+        prior: variance of an offset that is not zero, in squared pixels.
+    """
+    share = prior / (prior + variance)
+    odds = sqrt(1.0 - share) * exp(min(0.5 * share * mean**2 / variance, 100.0))
+    probability = odds / (1.0 + odds)
+    offset = probability * share * mean
+    second_moment = probability * (share * variance + (share * mean) ** 2)
+    return offset, sqrt(max(second_moment - offset**2, 0.0))
 
 
 def remaining_offset(problem: BundleProblem) -> tuple[float, float]:
@@ -101,10 +131,10 @@ def remaining_offset(problem: BundleProblem) -> tuple[float, float]:
     fitted to the costs at three offsets.
     """
     first = adjust(problem, iterations=5)
-    start = replace(problem, T_cw=first.T_cw, points=first.points)
+    start = trimmed(replace(problem, T_cw=first.T_cw, points=first.points))
 
     def cost(offset: float) -> float:
-        uvr = problem.uvr.copy()
+        uvr = start.uvr.copy()
         uvr[:, 2] -= offset
         shifted = replace(start, uvr=uvr)
         return adjust(shifted, iterations=ITERATIONS, use=first.inlier, tolerance=TOLERANCE).cost
@@ -114,3 +144,23 @@ def remaining_offset(problem: BundleProblem) -> tuple[float, float]:
     if not bend > 0.0:
         return 0.0, 0.0
     return 0.5 * STEP * (below - above) / bend, bend / STEP**2
+
+
+def trimmed(problem: BundleProblem) -> BundleProblem:
+    """Return the problem without the disparities whose residuals differ by more than ``TRIM``
+    standard deviations from the median. These observations become monocular."""
+    landmark = np.repeat(np.arange(len(problem.points)), np.diff(problem.first))
+    T_cw = problem.T_cw[problem.camera]
+    z = np.einsum("nj,nj->n", T_cw[:, 2, :3], problem.points[landmark]) + T_cw[:, 2, 3]
+    bf = problem.intrinsics[4]
+    with np.errstate(divide="ignore"):
+        residual = problem.uvr[:, 0] - problem.uvr[:, 2] - bf / z
+    residual *= np.sqrt(problem.inverse_sigma2)
+    stereo = np.isfinite(residual)
+    if not stereo.any():
+        return problem
+    apart = np.abs(residual - np.median(residual[stereo]))
+    sigma = DEVIATION_OF_MEDIAN * np.median(apart[stereo])
+    uvr = problem.uvr.copy()
+    uvr[apart > TRIM * sigma, 2] = np.nan
+    return replace(problem, uvr=uvr)

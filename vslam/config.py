@@ -83,8 +83,9 @@ class StereoConfig(Section):
     """Depth below which a stereo point is close, in baselines. Close points are mapped from one
     pair, most far ones triangulated from several keyframes. [OS2 III-A, printed]"""
     offset_sigma: float = Field(0.2, ge=0)
-    """Prior standard deviation of an offset that all disparities have in common, in pixels. The
-    motion of the camera reveals it (docs/research/motorway.md). With 0, none is estimated. [own]"""
+    """Prior standard deviation of the offset that all disparities have in common if they have one,
+    in pixels. The motion of the camera reveals it (docs/research/motorway.md). With 0, none is
+    estimated. [own]"""
 
 
 class DepthConfig(Section):

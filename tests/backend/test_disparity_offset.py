@@ -7,10 +7,11 @@ import pytest
 from stereo_noise import white_noise
 
 from vslam.backend.bundle_adjustment import BundleProblem
-from vslam.backend.disparity_offset import VARIANCE, offset_sigma, remaining_offset
+from vslam.backend.disparity_offset import VARIANCE, found_offset, remaining_offset, trimmed
 from vslam.config import StereoConfig
 from vslam.types.camera import Camera
 from vslam.types.features import MIN_DISPARITY, shifted_columns
+from vslam.types.map import Scalars
 
 CAMERA = Camera(700.0, 700.0, 600.0, 180.0, 0.54, 1200, 370)
 N_CAMERAS = 8
@@ -79,14 +80,52 @@ def test_columns_move_left_but_no_point_gets_behind_the_camera() -> None:
     np.testing.assert_allclose(shifted_columns(u_right, u, 0.5), [89.5, 99.4, np.nan], atol=1e-5)
 
 
-def test_the_error_of_the_estimate_shrinks_with_the_information() -> None:
-    config = StereoConfig(offset_sigma=0.2)
+def known_after(found: list[float], information: float) -> Scalars:
+    known = Scalars()
+    for offset in found:
+        known = found_offset(known, offset, information, StereoConfig(offset_sigma=0.2))
+    return known
 
-    def sigma(information: float) -> float:
-        return offset_sigma(information, config)
 
-    assert sigma(0.0) == 0.0  # nothing has been estimated yet
-    assert sigma(1e4) == pytest.approx(np.sqrt(VARIANCE) * 0.01, rel=0.01)
-    assert sigma(4e4) == pytest.approx(0.5 * sigma(1e4), rel=0.01)
-    free = StereoConfig(offset_sigma=0.0)  # for a loaded map, whose offset is kept
-    assert offset_sigma(1e4, free) == pytest.approx(np.sqrt(VARIANCE) * 0.01)
+def test_an_offset_within_its_noise_is_not_believed() -> None:
+    sigma = np.sqrt(VARIANCE / 5000.0)
+    known = known_after([1.5 * sigma], 5000.0)
+    assert known.offset_mean == pytest.approx(1.5 * sigma)
+    assert 0.0 < known.disparity_offset < 0.4 * known.offset_mean
+
+
+def test_an_offset_far_above_its_noise_is_added_whole() -> None:
+    known = known_after([0.1, 0.12, 0.11], 5000.0)
+    assert known.offset_windows == 3
+    assert known.disparity_offset == pytest.approx(0.11, rel=0.02)
+    assert known.offset_sigma == pytest.approx(np.sqrt(VARIANCE / 15000.0), rel=0.05)
+
+
+def test_windows_that_contradict_each_other_are_believed_less() -> None:
+    together = known_after([0.06, 0.06, 0.06, 0.06], 5000.0)
+    apart = known_after([-0.14, 0.26, -0.14, 0.26], 5000.0)
+    assert apart.offset_mean == pytest.approx(together.offset_mean)
+    assert apart.disparity_offset < 0.3 * together.disparity_offset
+    assert apart.offset_sigma > 2.0 * together.offset_sigma
+
+
+def test_the_mean_and_the_scatter_are_those_of_all_windows() -> None:
+    found = [0.02, 0.11, -0.03, 0.07]
+    known = Scalars()
+    weights = np.array([1000.0, 3000.0, 500.0, 2000.0])
+    for offset, information in zip(found, weights, strict=True):
+        known = found_offset(known, offset, float(information), StereoConfig())
+    mean = np.average(found, weights=weights)
+    assert known.offset_mean == pytest.approx(mean)
+    assert known.offset_scatter == pytest.approx(np.sum(weights * (found - mean) ** 2))
+
+
+def test_disparities_of_a_nearer_object_do_not_move_the_offset() -> None:
+    problem = drive(0.0, noise=0.3, seed=3)
+    rng = np.random.default_rng(1)
+    skewed = rng.uniform(size=len(problem.uvr)) < 0.25
+    problem.uvr[skewed, 2] -= rng.uniform(0.3, 1.0, skewed.sum())  # too large a disparity
+    found, _ = remaining_offset(problem)
+    kept = np.isfinite(trimmed(problem).uvr[:, 2])
+    assert kept[~skewed].mean() > kept[skewed].mean() + 0.2
+    assert abs(found) < 0.05

@@ -138,7 +138,7 @@ def test_a_checkpoint_waits_until_a_loop_that_was_found_is_closed():
 ZOOMING = Ring.create(focal_error=0.015, zoom=True)
 ENDS_EARLY = ROUND[: LAP + 14]
 # On the ring, the evidence of one keyframe is overwhelming by default.
-CAUTIOUS = ConsistencyConfig(max_wrong=1e-6, max_wrong_at_end=1e-6)
+CAUTIOUS = ConsistencyConfig(max_wrong=1e-8, max_wrong_at_end=1e-8)
 
 
 @pytest.mark.slow

@@ -337,13 +337,13 @@ def test_foreign_files_are_refused(tmp_path):
 
 
 def test_other_schemas_are_named(file, tmp_path):
-    newer = as_header(header_of(file) | {"schema": 15})
-    assert "schema 15, but this version of vslam reads schema 14" in refusal(
+    newer = as_header(header_of(file) | {"schema": 16})
+    assert "schema 16, but this version of vslam reads schema 15" in refusal(
         changed(file, tmp_path / "n.npz", header=newer)
     )
     old = tmp_path / "old.npz"
     np.savez(old, schema=1, keyframe_first_row=np.zeros(1, np.int64))
-    assert "reads schema 14; make the map again" in refusal(old)
+    assert "reads schema 15; make the map again" in refusal(old)
 
 
 def damage(name: str, position: tuple[int, ...], value: float):

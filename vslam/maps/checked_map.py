@@ -100,7 +100,10 @@ def _scalars(entry: dict[str, Any]) -> Scalars:
     names = asdict(Scalars())
     scalars = Scalars(**{name: type(default)(entry[name]) for name, default in names.items()})
     _require(abs(scalars.disparity_offset) < _MAX_OFFSET, "disparity_offset is out of range")
-    _require(0.0 <= scalars.offset_information < np.inf, "offset_information is out of range")
+    _require(abs(scalars.offset_mean) < _MAX_OFFSET, "offset_mean is out of range")
+    for name in ("offset_sigma", "offset_information", "offset_scatter"):
+        _require(0.0 <= getattr(scalars, name) < np.inf, f"{name} is out of range")
+    _require(0 <= scalars.offset_windows < _MAX_SESSION, "offset_windows is out of range")
     _require(0 <= scalars.session < _MAX_SESSION, "session is out of range")
     return scalars
 

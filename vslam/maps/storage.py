@@ -29,7 +29,7 @@ from vslam.types.camera import Camera
 from vslam.types.frame_poses import FrameTable
 from vslam.types.map_kernels import gather_observations, resolve
 
-SCHEMA = 14
+SCHEMA = 15
 _UNKNOWN = np.full((6, 6), np.nan)  # covariance
 _FOREIGN = "not a map of vslam; give a map.npz or the folder of a run"
 

@@ -18,7 +18,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam.backend.disparity_offset import offset_sigma
 from vslam.frontend.patch_tracking import stride_of
 from vslam.frontend.patches import RecentPatches, patches_of_frame, patches_of_landmarks
 from vslam.method.closing import LoopClosing, LoopSearch
@@ -269,7 +268,7 @@ class PublishedMap:
         self.view = replace(
             view_of(map_, keyframe, local, patches, stride, monocular=monocular),
             part=part_of(map_, self._closing.closed, keyframe),
-            offset_sigma=offset_sigma(map_.scalars.offset_information, config.stereo),
+            offset_sigma=map_.scalars.offset_sigma,
         )
 
     def refer_to_new(self, keyframe: int, track: Track) -> None:

@@ -163,15 +163,22 @@ class Scalars:
         disparity_offset: number of pixels by which every measured disparity is too small. All
             columns of stereo matches in the right image (``Arrays.u_right``) are already corrected
             by this offset (``backend/disparity_offset.py``).
-        offset_information: inverse variance of the measurements from which ``disparity_offset`` was
-            estimated.
+        offset_sigma: standard deviation of ``disparity_offset``, in pixels. It is 0 before the
+            offset has been estimated.
+        offset_mean, offset_information, offset_scatter, offset_windows: weighted mean of the
+            estimates of the offset, in pixels, the sum of their weights, the weighted sum of their
+            squared deviations from the mean, and their number.
         calibrated_until: the newest keyframe from which the disparity offset was estimated, or -1.
         metric: whether an IMU has shown that the unit of a monocular map is the metre.
     """
 
     session: int = 0
     disparity_offset: float = 0.0
+    offset_sigma: float = 0.0
+    offset_mean: float = 0.0
     offset_information: float = 0.0
+    offset_scatter: float = 0.0
+    offset_windows: int = 0
     calibrated_until: int = NONE
     metric: bool = False
 

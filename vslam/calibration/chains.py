@@ -3,7 +3,8 @@
 The result are *chains*: a few keyframes each, between which the image moves by similar amounts, and
 the positions of corners in them. Corners are followed from image to image with the tracker of Lucas
 and Kanade in pyramids (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker",
-2001) of OpenCV.
+2001) of OpenCV. Because they drift, each keyframe aligns them to the first keyframe of their chain
+(`vslam.calibration.affine_patches`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vslam.calibration.affine_patches import Patches
 from vslam.calibration.models import Array
 from vslam.types.camera import Image
 
@@ -30,6 +32,7 @@ _STEP = 0.04  # median motion of the corners between two keyframes, in longer si
 _LONGEST = 150  # frames of a chain; the error of a followed corner grows with every frame
 _BACK_PX = 0.5  # distance by which a corner may miss its place when it is followed back [own]
 _WINDOW, _LEVELS = (21, 21), 4
+_EMPTY = np.zeros((2, 2), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,7 @@ def chains_of(images: Iterable[tuple[float, Image]]) -> Iterator[Chain]:
     start = time = 0.0
     xy, kept, found = np.zeros((0, 2), np.float32), np.zeros(0, int), [np.zeros((0, 2))]
     flows: list[Array] = []
+    patches, deformed = Patches.around(_EMPTY, xy), np.zeros((0, 2, 2))
     n = 0
     for time, full in images:
         image, scale = _smaller(full)
@@ -75,6 +79,8 @@ def chains_of(images: Iterable[tuple[float, Image]]) -> Iterator[Chain]:
             if len(xy) < _FEWEST or n > _LONGEST:
                 xy = xy[:0]
             elif shift >= _STEP or (left < _LEFT and shift >= _STEP / 4):
+                aligned, deformed[kept], good = patches.aligned(image, kept, xy, deformed[kept])
+                xy, kept, flow = aligned[good].astype(np.float32), kept[good], flow[good]
                 found.append(_spread(xy, kept, found[0]))
                 flows.append(_spread(flow, kept, found[0]))
             if len(found) == KEYFRAMES:
@@ -87,6 +93,7 @@ def chains_of(images: Iterable[tuple[float, Image]]) -> Iterator[Chain]:
             xy = _corners(image)
             kept, found, start, n = np.arange(len(xy)), [xy.astype(float)], time, 0
             flows = []
+            patches, deformed = Patches.around(image, xy), np.tile(np.eye(2), (len(xy), 1, 1))
         before = image
 
 

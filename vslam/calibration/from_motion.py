@@ -48,8 +48,9 @@ _NO_PARALLAX = 1.2
 # standard deviation predicts. [own]
 _OTHER, _LEAST_RISE = 0.2, 0.25
 _MOST_MINIMA, _BETTER = 3, 1e-3  # local minima that are left, and the least reduction of the cost
-# The errors of a corner in the keyframes of a chain are not independent, because it is followed
-# from one to the next. This is the variance after half of the keyframes, relative to a step.
+# The errors of a corner in the keyframes of a chain are not independent, because all are found by
+# the same patch, which does not deform quite affinely. This is the variance of their mean, relative
+# to independent errors, if half of the keyframes have the same error. [own]
 _DRIFT = KEYFRAMES / 2.0
 _TWO_SIGMAS = 0.975  # share of the distribution below two standard deviations
 _LITTLE = 1e-9  # relative information of the other chains, if a chain tells all

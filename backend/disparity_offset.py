@@ -29,7 +29,7 @@ from math import exp, sqrt
 import numpy as np
 
 from vslam.backend.bundle_adjustment import BundleProblem, adjust
-from vslam.backend.local_mapping import adjust_locally, assemble, map_keyframe
+from vslam.backend.local_mapping import adjust_locally, assemble, refine_map
 from vslam.config import StereoConfig
 from vslam.types.context import Context
 from vslam.types.features import shifted_columns
@@ -51,12 +51,12 @@ VARIANCE = 3.0
 TOLERANCE = 1e-5  # least relative decrease of the cost; STEP changes it by some thousandths
 
 
-def map_and_calibrate(
+def refine_and_calibrate(
     map_: Map, keyframe: int, context: Context, inertial: InertialWindow | None = None
 ) -> None:
-    """Run local mapping for a new keyframe (``map_keyframe``). For a stereo camera, the disparity
+    """Adjust the map around a new keyframe (``refine_map``). For a stereo camera, the disparity
     offset of the map is updated after every ``_OFFSET_KEYFRAMES`` keyframes."""
-    map_keyframe(map_, keyframe, context, inertial)
+    refine_map(map_, keyframe, context, inertial)
     if context.config.stereo.offset_sigma > 0.0 and context.camera.sensor == "stereo":
         _calibrate(map_, keyframe, context, inertial)
 

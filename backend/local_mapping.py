@@ -37,19 +37,24 @@ INERTIAL_KEYFRAMES = 10  # newest keyframes that inertial factors connect
 RECENT_KEYFRAMES = 3  # how long a landmark is on probation, in keyframes (ORB-SLAM, VI-B)
 
 
-def map_keyframe(
-    map_: Map, keyframe: int, context: Context, inertial: InertialWindow | None = None
-) -> None:
-    """Run local mapping for a new keyframe, which must already be linked to its landmarks.
-
-    Args:
-        inertial: what is known from the IMU at the keyframe; None without an IMU.
-    """
+def extend_map(map_: Map, keyframe: int, context: Context) -> None:
+    """Find further observations of a new keyframe, which must already be linked to its landmarks:
+    triangulate new landmarks, and fuse duplicates."""
     cull_recent_landmarks(map_, keyframe, context.camera)
     triangulate_with_neighbours(map_, keyframe, context)
     refresh_keyframe(map_, keyframe)
     fuse_neighbourhood(map_, keyframe, context)
     refresh_keyframe(map_, keyframe)
+
+
+def refine_map(
+    map_: Map, keyframe: int, context: Context, inertial: InertialWindow | None = None
+) -> None:
+    """Adjust the map around a new keyframe (``extend_map``), and cull redundant keyframes.
+
+    Args:
+        inertial: what is known from the IMU at the keyframe; None without an IMU.
+    """
     if inertial is not None:
         record_motion(map_, keyframe, inertial)
     adjust_locally(map_, keyframe, context, inertial)

@@ -110,10 +110,37 @@ def find_patches(
         NaN if the patch was not found. The expected position is first rounded to a whole pixel of
         the octave.
     """
-    view, size = known.view[at], known.size[at]
-    warp = warps(T_cw, xyz, known.T_cw, view, size, scales[octave], intrinsics)
+    seen = patches_around(pyramid, xy, octave)
+    return register(seen, T_cw, xyz, scales[octave], known, at, intrinsics, config)
+
+
+def register(
+    seen: NDArray[np.uint8],
+    T_cw: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    size: NDArray[np.float64],
+    known: LandmarkPatches,
+    at: NDArray[np.int64],
+    intrinsics: NDArray[np.float64],
+    config: AlignmentConfig,
+) -> NDArray[np.float32]:
+    """Register the known patches of N landmarks to patches of an image.
+
+    Args:
+        seen: ``(N, PATCH_PIXELS)`` uint8 patches of the image.
+        T_cw: ``(4, 4)`` pose of the camera that took the image (world to camera).
+        xyz: ``(N, 3)`` positions of the landmarks, in the world frame.
+        size: ``(N,)`` full-resolution pixels per pixel of ``seen``.
+        at: ``(N,)`` index of each landmark's patch in ``known``.
+        intrinsics: ``(6,)``, see ``Camera.intrinsics``.
+
+    Returns:
+        ``(N, 2)`` float32 position of each landmark in pixels of ``seen``, relative to its middle;
+        NaN if the patch does not match.
+    """
+    warp = warps(T_cw, xyz, known.T_cw, known.view[at], known.size[at], size, intrinsics)
     return align(
-        patches_around(pyramid, xy, octave),
+        seen,
         known.pixels,
         known.shift,
         known.where[at],

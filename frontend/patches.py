@@ -128,6 +128,7 @@ class RecentPatches:
         self._n_features = np.zeros(capacity, np.int64)
         self._pixels = np.empty((capacity, 0, PATCH_PIXELS), np.uint8)
         self._shift = np.empty((capacity, 0, 2), np.float32)
+        self._xy = np.empty((capacity, 0, 2), np.float32)
         self._next = 0
 
     def remember(self, track: Track, keyframe: int, scales: NDArray[np.float64]) -> None:
@@ -139,7 +140,8 @@ class RecentPatches:
         """
         if track.extracted.pyramid is not None:
             everything = np.arange(len(track.features))
-            self.add(KeyframePatches(keyframe, *_patches_of(track, everything, scales)))
+            patches = _patches_of(track, everything, scales)
+            self.add(KeyframePatches(keyframe, *patches, track.refined_features().xy))
 
     def add(self, patches: KeyframePatches) -> None:
         """Store the patches of one keyframe. If the store is full, they replace the patches of the
@@ -147,8 +149,9 @@ class RecentPatches:
         slot, n = self._next, len(patches.pixels)
         if n > self._shift.shape[1]:
             self._pixels = _widened(self._pixels, n)
-            self._shift = _widened(self._shift, n)
+            self._shift, self._xy = _widened(self._shift, n), _widened(self._xy, n)
         self._pixels[slot, :n], self._shift[slot, :n] = patches.pixels, patches.shift
+        self._xy[slot, :n] = patches.xy
         self._keyframes[slot], self._n_features[slot] = patches.keyframe, n
         self._next = (slot + 1) % len(self._keyframes)
 
@@ -160,6 +163,7 @@ class RecentPatches:
                 int(self._keyframes[slot]),
                 self._pixels[slot, : self._n_features[slot]].copy(),
                 self._shift[slot, : self._n_features[slot]].copy(),
+                self._xy[slot, : self._n_features[slot]].copy(),
             )
             for slot in slots
             if self._keyframes[slot] >= 0
@@ -179,15 +183,18 @@ class RecentPatches:
         row, view = newest_rows(arrays, self._keyframes, ids)
         seen = np.flatnonzero(row >= 0)
         row, view = row[seen], view[seen]
-        keyframes = np.maximum(self._keyframes, 0)
+        keyframes, size = np.maximum(self._keyframes, 0), map_.scales[arrays.octave[row]]
+        where = view * width + row - arrays.first_row[keyframes[view]]
+        shift = self._shift.reshape(-1, 2).copy()
+        shift[where] += (arrays.xy[row] - self._xy.reshape(-1, 2)[where]) / size[:, None]
         return LandmarkPatches(
             ids[seen],
-            view * width + row - arrays.first_row[keyframes[view]],
+            where,
             view,
-            map_.scales[arrays.octave[row]],
+            size,
             arrays.angle[row],
             self._pixels.reshape(-1, PATCH_PIXELS),
-            self._shift.reshape(-1, 2),
+            shift,
             arrays.T_cw[keyframes],
         )
 

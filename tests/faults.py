@@ -93,7 +93,7 @@ POINTS = (
     Point("learned verification", "vslam.loopclosure.verifier.with_similarities", 1, ON),
     Point("pose graph", "vslam.method.closing.solve", 1, ON),
     Point("inserting a keyframe", "vslam.method.mapping.map_stereo_points", 12, MAPLESS),
-    Point("mapping job", "vslam.method.mapping.map_and_calibrate", 12, MAPLESS),
+    Point("mapping job", "vslam.method.mapping.refine_and_calibrate", 12, MAPLESS),
     Point("start of a job", "vslam.method.shared_map.SharedMap.start", 12, MAPLESS),
     Point("closing job, correction", "vslam.method.closing.move_keyframes", 1, MAPLESS),
     Point("closing job, fusion", "vslam.method.closing.fuse_loop", 1, MAPLESS),

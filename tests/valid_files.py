@@ -241,7 +241,7 @@ def map_file(folder: Path) -> None:
     map_.cull_keyframe(1)
     waits = LoopEdge(2, 0, 0.5, True, "", T_query_match=np.eye(4))
     patches = KeyframePatches(
-        2, np.zeros((n, PATCH_PIXELS), np.uint8), np.zeros((n, 2), np.float32)
+        2, np.zeros((n, PATCH_PIXELS), np.uint8), np.zeros((n, 2), np.float32), features.xy
     )
     known_place = FramePatches(
         2,

@@ -14,8 +14,9 @@ from vslam.backend.local_mapping import (
     assemble,
     cull_keyframes,
     cull_recent_landmarks,
+    extend_map,
     local_window,
-    map_keyframe,
+    refine_map,
     refresh_keyframe,
     remove_observations,
 )
@@ -626,7 +627,8 @@ def test_mapping_a_keyframe_keeps_the_map_sound_and_true(check_map):
         if k:
             tracked = world.map.landmarks_of(k - 1)
             fuse_into(world.map, tracked, k, CONTEXT)
-            map_keyframe(world.map, k, CONTEXT)
+            extend_map(world.map, k, CONTEXT)
+            refine_map(world.map, k, CONTEXT)
         check_map(world.map)
     a = world.map.arrays
     mixed = [i for i in world.map.living_landmarks() if len(world.point_of_landmark(i)) > 1]

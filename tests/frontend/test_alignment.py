@@ -8,6 +8,7 @@ from parts import frame_of
 
 from vslam.config import Config
 from vslam.frontend.alignment import align, align_matches, warps
+from vslam.frontend.keyframe_alignment import align_observations
 from vslam.frontend.orb import build_pyramid, extract
 from vslam.frontend.patches import RecentPatches, patches_around
 from vslam.frontend.tracking import refine
@@ -171,7 +172,8 @@ def one_landmark(shift=0.0):
     keyframe = map_.add_keyframe(features_at(320, 240, 2, 1), np.eye(4), 0.0, 0)
     ids = map_.add_landmarks(np.array([[3.0, 0.0, 10.0]]), np.zeros((1, 4), np.uint64), keyframe)
     link_many(map_.arrays, np.array([0]), ids)
-    return map_, KeyframePatches(keyframe, patch, np.full((1, 2), shift, np.float32))
+    at = map_.arrays.xy[:1].copy()
+    return map_, KeyframePatches(keyframe, patch, np.full((1, 2), shift, np.float32), at)
 
 
 def patches_of(map_, ids, keyframes, capacity=3):
@@ -201,7 +203,8 @@ def test_a_landmark_has_the_patch_of_the_newest_keyframe_that_observes_it():
         T_cw[2, 3] = -2.0 * k
         map_.add_keyframe(features_at(320, 240, 0, 2), T_cw, 0.1 * k, k)
     link_many(map_.arrays, np.array([1]), np.array([0], np.int32))
-    recent = [first, *(KeyframePatches(k, both, np.zeros((2, 2), np.float32)) for k in (1, 2))]
+    nothing, at = np.zeros((2, 2), np.float32), map_.arrays.xy[1:3].copy()
+    recent = [first, *(KeyframePatches(k, both, nothing, at) for k in (1, 2))]
     known, pixels, _ = patches_of(map_, [0], recent)
     assert np.array_equal(pixels, second)
     assert known.T_cw[known.view, 2, 3].tolist() == [-2.0]
@@ -215,7 +218,12 @@ def test_a_landmark_has_the_patch_of_the_newest_keyframe_that_observes_it():
 def test_recent_patches_are_those_of_the_newest_keyframes():
     recent = RecentPatches(2)
     ones = [
-        KeyframePatches(k, np.full((n, PATCH_PIXELS), k, np.uint8), np.full((n, 2), k, np.float32))
+        KeyframePatches(
+            k,
+            np.full((n, PATCH_PIXELS), k, np.uint8),
+            np.full((n, 2), k, np.float32),
+            np.full((n, 2), 10 * k, np.float32),
+        )
         for k, n in ((3, 2), (4, 5), (7, 1))
     ]
     for count, one in enumerate(ones, 1):
@@ -225,6 +233,7 @@ def test_recent_patches_are_those_of_the_newest_keyframes():
         for is_, wanted in zip(recent.all(), kept, strict=True):
             assert np.array_equal(is_.pixels, wanted.pixels)
             assert np.array_equal(is_.shift, wanted.shift)
+            assert np.array_equal(is_.xy, wanted.xy)
 
 
 def test_landmarks_that_no_recent_keyframe_observes_have_none():
@@ -277,7 +286,7 @@ def test_matches_are_aligned_however_the_camera_has_moved(motion):
     link_many(map_.arrays, np.arange(n), ids)
     recent = RecentPatches(2)
     pixels = patches_around(first.extracted.pyramid, first.features.xy, first.features.octave)
-    recent.add(KeyframePatches(0, pixels, seen_at - first.features.xy))
+    recent.add(KeyframePatches(0, pixels, seen_at - first.features.xy, first.features.xy))
 
     frame, truth = frame_at(T_cw, rng.uniform(-0.5, 0.5, (n, 2)))
     inside = ((truth > 20) & (truth < [620, 460])).all(axis=1)
@@ -290,6 +299,67 @@ def test_matches_are_aligned_however_the_camera_has_moved(motion):
     assert np.isfinite(error).mean() > 0.8
     assert np.nanmedian(error) < 0.05
     assert np.nanquantile(error, 0.9) < 0.15
+
+
+def three_views(certain):
+    """Make a map of three keyframes that see 40 points of a plane, each at the nearest whole pixel
+    to a place half a pixel away, and the patches around these keypoints. Keyframe ``certain`` is
+    aligned to the points.
+
+    Returns:
+        The map, the patches, and the ``(3, 40, 2)`` true positions.
+    """
+    image, rng, n = wide_scene(random_scene(4)), np.random.default_rng(0), 40
+    points = np.column_stack([rng.uniform(-3, 3, n), rng.uniform(-2, 2, n), np.full(n, 10.0)])
+    map_, patches, truth = Map(CONTEXT.scales), [], []
+    ids = map_.add_landmarks(points, np.zeros((n, 4), np.uint64), 0)
+    for k, motion in enumerate(([0.0] * 6, [0.1, 0, -0.4, 0, 0, 0.05], [0.2, 0, -0.8, 0, 0, 0.1])):
+        T_cw = se3_exp(np.array(motion))
+        at = CAMERA.project(transform(T_cw, points))[:, :2].astype(np.float32)
+        pixel = np.rint(at + rng.uniform(-0.5, 0.5, (n, 2))).astype(np.float32)
+        shift = at - pixel if k == certain else np.zeros_like(pixel)
+        features = replace(features_at(0, 0, 0, n), xy=pixel + shift)
+        map_.add_keyframe(features, T_cw, 0.1 * k, k, 4 if k == certain else 1)
+        link_many(map_.arrays, n * k + np.arange(n), ids)
+        pixels = patches_around(
+            build_pyramid(image(T_cw), Config().orb), pixel, np.zeros(n, np.uint8)
+        )
+        patches.append(KeyframePatches(k, pixels, shift, features.xy))
+        truth.append(at)
+    return map_, tuple(patches), np.array(truth)
+
+
+@pytest.mark.parametrize("certain", [0, 1, 2])
+def test_observations_of_keyframes_are_aligned_to_the_certain_one(certain):
+    map_, patches, truth = three_views(certain)
+    before = map_.arrays.xy[: map_.n_rows].copy()
+    rows, xy = align_observations(map_, 2, patches, CONTEXT)
+    assert np.array_equal(map_.arrays.xy[: map_.n_rows], before)
+    assert (rows // 40 != certain).all()
+    assert len(rows) > 0.8 * 80
+    error = np.linalg.norm(xy - truth.reshape(-1, 2)[rows], axis=1)
+    assert np.median(np.linalg.norm(before - truth.reshape(-1, 2), axis=1)[rows]) > 0.3
+    assert np.median(error) < 0.05
+    assert np.quantile(error, 0.9) < 0.15
+    # Their patches now lie around the landmarks.
+    map_.move_observations(rows, xy, 4)
+    known, _, shift = patches_of(map_, range(40), patches)
+    assert set(known.view) == {2}
+    aligned = np.isin(80 + np.arange(40), rows) | (certain == 2)
+    wanted = truth[2] - np.rint(patches[2].xy - patches[2].shift)
+    assert np.quantile(np.abs(shift - wanted)[aligned], 0.9) < 0.15
+    # The second time, there is nothing left to be aligned.
+    assert len(align_observations(map_, 2, patches, CONTEXT)[0]) < 10
+
+
+def test_observations_without_a_certain_one_or_without_a_patch_are_not_aligned():
+    map_, patches, _ = three_views(certain=-1)
+    assert len(align_observations(map_, 2, patches, CONTEXT)[0]) == 0
+    map_, patches, _ = three_views(certain=0)
+    assert len(align_observations(map_, 2, patches[1:], CONTEXT)[0]) == 0
+    assert len(align_observations(map_, 2, (), CONTEXT)[0]) == 0
+    rows, _ = align_observations(map_, 2, patches[::2], CONTEXT)
+    assert set(rows // 40) == {2}
 
 
 def test_what_lies_behind_a_camera_or_is_seen_from_behind_has_no_warp():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from unittest.mock import patch
 
 import cv2
@@ -93,11 +94,12 @@ def test_small_images_of_a_damaged_file_are_recognised(corridor):
         assert not is_coarse(replace(made, **damage), shapes, image.shape)
 
 
-def driven(corridor, config=CONFIG, *, threads=1, images=None, frames=None):
-    slam = Slam(corridor.camera, config, "none", threads=threads)
+def driven(corridor, config=CONFIG, *, threads=1, images=None, frames=None, monocular=False):
+    camera = corridor.camera.left_camera() if monocular else corridor.camera
+    slam = Slam(camera, config, "none", threads=threads)
     left = corridor.left if images is None else images
     results = [
-        slam.step(left[k], corridor.right[k], corridor.timestamps[k])
+        slam.step(left[k], None if monocular else corridor.right[k], corridor.timestamps[k])
         for k in range(frames or len(corridor))
     ]
     if frames is None:
@@ -267,19 +269,22 @@ def test_a_frame_that_shows_something_else_is_lost_and_the_next_is_not(corridor)
 
 
 @pytest.mark.slow
-def test_the_same_bytes_with_two_threads_and_after_a_resume(corridor, tmp_path):
-    whole, _ = driven(corridor)
+@pytest.mark.parametrize("monocular", [False, True])
+def test_the_same_bytes_with_two_threads_and_after_a_resume(corridor, monocular, tmp_path):
+    drive = partial(driven, corridor, monocular=monocular)
+    whole, _ = drive()
     expected = whole.trajectory().T_wc.tobytes()
-    assert driven(corridor, threads=2)[0].trajectory().T_wc.tobytes() == expected
+    assert drive(threads=2)[0].trajectory().T_wc.tobytes() == expected
     resumed = 0
     for cut in range(6, 20):
-        slam, _ = driven(corridor, frames=cut)
+        slam, _ = drive(frames=cut)
         if slam.stored_map().checkpoint is None:
             continue  # a keyframe is being mapped
         slam.save(tmp_path / "map.npz", resumable=True)
         again = Slam.load(tmp_path / "map.npz", CONFIG, "none", resume=True, threads=1)
         for k in range(cut, len(corridor)):
-            again.step(corridor.left[k], corridor.right[k], corridor.timestamps[k])
+            right = None if monocular else corridor.right[k]
+            again.step(corridor.left[k], right, corridor.timestamps[k])
         again.finish()
         assert again.trajectory().T_wc.tobytes() == expected, cut
         resumed += 1

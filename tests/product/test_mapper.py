@@ -704,7 +704,7 @@ def test_a_map_that_is_incomplete_is_not_saved(failing, threads, tmp_path, monke
             raise BrokenError
 
     # The first keyframe is mapped at once, the others by a job.
-    function = "map_and_calibrate" if failing else "map_stereo_points"
+    function = "refine_and_calibrate" if failing else "map_stereo_points"
     monkeypatch.setattr(f"vslam.method.mapping.{function}", fail)
     path = tmp_path / "map.npz"
     path.write_bytes(b"an older map")
@@ -786,6 +786,7 @@ def test_the_patches_of_keyframes_are_part_of_the_state():
             keyframe,
             rng.integers(0, 256, (240, PATCH_PIXELS), dtype=np.uint8),
             rng.normal(size=(240, 2)).astype(np.float32),
+            rng.normal(size=(240, 2)).astype(np.float32),
         )
         for keyframe in (0, 1)
     )
@@ -797,6 +798,7 @@ def test_the_patches_of_keyframes_are_part_of_the_state():
         assert mine.keyframe == theirs.keyframe
         np.testing.assert_array_equal(mine.pixels, theirs.pixels)
         np.testing.assert_array_equal(mine.shift, theirs.shift)
+        np.testing.assert_array_equal(mine.xy, theirs.xy)
     shown = drive.published.view.patches
     assert set(shown.ids) == set(drive.published.map.landmarks_of(1))
 

@@ -188,6 +188,28 @@ def test_tracking_sees_nothing_of_mapping_before_it_is_published(corridor, confi
 
 
 @pytest.mark.slow
+def test_tracking_of_one_camera_sees_nothing_of_mapping_before_it_is_published(
+    corridor, monkeypatch
+):
+    """Mapping also aligns what keyframes observed, whose patches tracking reads."""
+
+    def drive(threads: int) -> bytes:
+        slam = Slam(corridor.camera.left_camera(), CONFIG, "none", threads=threads)
+        results = [
+            slam.step(left, None, timestamp)
+            for left, timestamp in zip(corridor.left, corridor.timestamps, strict=True)
+        ]
+        slam.finish()
+        assert slam.map.n_keyframes > 5
+        return bytes_of(slam, results)
+
+    late = drive(1)
+    assert drive(2) == late
+    monkeypatch.setattr("vslam.slam.Workers", InstantWorkers)
+    assert drive(2) == late
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [CONFIG, EAGER], ids=["usual", "a keyframe each frame"])
 @pytest.mark.parametrize("dark", [(), range(9, 14)])
 def test_dropping_culled_landmarks_changes_no_byte(corridor, config, dark, monkeypatch, check_map):
@@ -547,7 +569,7 @@ def test_a_keyframe_that_cannot_be_mapped_is_the_last_thing_that_happens(
     def fail(*_: object) -> None:
         raise ZeroDivisionError("injected")
 
-    monkeypatch.setattr("vslam.method.mapping.map_and_calibrate", fail)
+    monkeypatch.setattr("vslam.method.mapping.refine_and_calibrate", fail)
     with pytest.raises(ZeroDivisionError, match="injected"):
         drive(range(3, 6))
     monkeypatch.undo()

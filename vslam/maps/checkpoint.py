@@ -14,7 +14,7 @@ from vslam.types.map import Map
 from vslam.types.states import Checkpoint, PublishedState
 from vslam.types.track import Track
 
-SCHEMA = 8
+SCHEMA = 9
 _MOST = 1e12  # metres, pixels or seconds
 LOOP_SHAPES = {
     "LoopEdge.T_query_match": (4, 4),
@@ -50,6 +50,7 @@ CHECKPOINTS = Codec(
         "Standstill.xy": ("N", 2),
         "KeyframePatches.pixels": ("N", PATCH_PIXELS),
         "KeyframePatches.shift": ("N", 2),
+        "KeyframePatches.xy": ("N", 2),
         "FramePatches.landmark": ("N",),
         "FramePatches.octave": ("N",),
         "FramePatches.angle": ("N",),

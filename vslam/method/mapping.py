@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from vslam.backend.disparity_offset import map_and_calibrate
+from vslam.backend.disparity_offset import refine_and_calibrate
 from vslam.backend.keyframe_motions import record_motion
-from vslam.backend.local_mapping import MIN_SHARED, refresh_keyframe
+from vslam.backend.local_mapping import MIN_SHARED, extend_map, refresh_keyframe
 from vslam.backend.metric_mapping import (
     MapScale,
     adjust_widely,
@@ -19,6 +19,7 @@ from vslam.backend.metric_mapping import (
     scale_of_map,
 )
 from vslam.backend.triangulation import map_stereo_points
+from vslam.frontend.keyframe_alignment import align_observations
 from vslam.frontend.patches import certainty_of
 from vslam.method.closing import LoopClosing
 from vslam.method.map_frames import (
@@ -37,6 +38,7 @@ from vslam.method.starter import TwoViewStart
 from vslam.support.workers import Workers
 from vslam.types.camera import Image
 from vslam.types.context import Context
+from vslam.types.features import KeyframePatches
 from vslam.types.frame_poses import FrameTable
 from vslam.types.imu import InertialWindow
 from vslam.types.map import Map
@@ -98,7 +100,8 @@ class Mapper:
                 search = partial(
                     closing.search, keyframe=keyframe, features=track.features, image=image
                 )
-                job = partial(self._map_keyframe, keyframe, track.inertial)
+                patches = published.newest_patches() if self._context.camera.monocular else ()
+                job = partial(self._map_keyframe, keyframe, track.inertial, patches)
                 published.start(job, search)
             else:
                 closing.process(map_, keyframe, track.features, image)
@@ -235,8 +238,17 @@ class Mapper:
         keyframe, R_wc = int(map_.living_keyframes()[-1]), self.published.frames.pose(-1)[:3, :3].T
         adjust_widely(map_, keyframe, self._context, inertial, R_wc)
 
-    def _map_keyframe(self, keyframe: int, inertial: InertialWindow | None, map_: Map) -> None:
-        map_and_calibrate(map_, keyframe, self._context, inertial)
+    def _map_keyframe(
+        self,
+        keyframe: int,
+        inertial: InertialWindow | None,
+        patches: tuple[KeyframePatches, ...],
+        map_: Map,
+    ) -> None:
+        extend_map(map_, keyframe, self._context)
+        found = align_observations(map_, keyframe, patches, self._context)
+        map_.move_observations(*found, self._context.aligned_certainty)
+        refine_and_calibrate(map_, keyframe, self._context, inertial)
         if self._context.camera.monocular and inertial is not None and is_wide(map_, keyframe):
             record_missing_motions(map_, newest_unit(map_), inertial)
             R_wc = map_.keyframe_pose(keyframe)[:3, :3].T

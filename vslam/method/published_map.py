@@ -27,7 +27,7 @@ from vslam.method.recent_frames import RecentFrames
 from vslam.method.shared_map import SharedMap
 from vslam.support.workers import Job, Workers
 from vslam.types.context import Context
-from vslam.types.features import FramePatches, TrackingState
+from vslam.types.features import FramePatches, KeyframePatches, TrackingState
 from vslam.types.frame_poses import FramePoses, FrameTable
 from vslam.types.geometry import Matrix, inverse
 from vslam.types.map import Map
@@ -279,6 +279,10 @@ class PublishedMap:
         self.refer_to(keyframe)
         self.frames.replace(track.index, keyframe)
         self._recent.forget(track.index)
+
+    def newest_patches(self) -> tuple[KeyframePatches, ...]:
+        """Return copies of the image patches of the newest keyframes, oldest keyframe first."""
+        return self._patches.all()
 
     def refer_to_known(self, keyframe: int, track: Track) -> None:
         """Make the old keyframe of a known place the reference keyframe of a frame."""

@@ -151,11 +151,14 @@ class KeyframePatches(NamedTuple):
         pixels: ``(N, PATCH_PIXELS)`` uint8, the square patch around each keypoint, row by row.
         shift: ``(N, 2)`` float32, vector from each keypoint to the position of its landmark after
             sub-pixel alignment, in pixels of the keypoint's octave.
+        xy: ``(N, 2)`` float32, this position in the map when ``shift`` was measured, in
+            full-resolution pixels. Local mapping may align the keypoint later.
     """
 
     keyframe: int
     pixels: NDArray[np.uint8]
     shift: NDArray[np.float32]
+    xy: NDArray[np.float32]
 
 
 class FramePatches(NamedTuple):

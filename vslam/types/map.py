@@ -308,6 +308,16 @@ class Map:
         self.n_keyframes += 1
         return k
 
+    def move_observations(
+        self, rows: NDArray[np.int64], xy: NDArray[np.float32], certainty: int
+    ) -> None:
+        """Replace the positions of ``(N,)`` keypoints by ``(N, 2)`` aligned ones, in pixels.
+
+        Args:
+            certainty: ``Arrays.certainty`` of the new positions.
+        """
+        self.arrays.xy[rows], self.arrays.certainty[rows] = xy, certainty
+
     def add_landmarks(
         self, xyz: NDArray[np.float64], descriptors: NDArray[np.uint64], keyframe: int
     ) -> NDArray[np.int32]:

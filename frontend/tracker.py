@@ -117,6 +117,8 @@ class Tracker:
                 return track
         if last.twist is None or not predicted.is_tracking:
             return NO_PATCHES_FOUND
+        if self._context.awaits_scale(metric=view.metric):
+            return NO_PATCHES_FOUND
 
         def track_from(T_start: Matrix) -> PatchTrack:
             return track_patches(pyramid, T_start, view, self._context, images.mask)

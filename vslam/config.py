@@ -123,8 +123,8 @@ class TrackingConfig(Section):
     method: Literal["auto", "orb", "patches"] = "auto"
     """`patches` searches for image patches of the landmarks (Forster et al., T-RO 2017), and
     extracts features only when a keyframe is due or too few patches are found. `orb` matches ORB
-    features in every frame. `auto` is `orb` for one camera without an IMU, and `patches` for all
-    others. [own]"""
+    features in every frame. `auto` is `orb` for one camera until an IMU tells its scale, and
+    `patches` for all others. [own]"""
     patch_min_inliers: int = Field(40, ge=10)
     """Features are extracted if fewer patches than this agree with the pose. [own]"""
     patch_min_inlier_ratio: float = Field(0.8, ge=0, le=1)

@@ -86,6 +86,15 @@ def test_the_map_becomes_metric_when_the_motion_tells_its_scale(drive):
     assert SCALE_UNKNOWN not in drive.slam.problems
 
 
+def test_features_are_matched_until_the_scale_is_known_and_patches_afterwards(drive):
+    results, since = drive.results, drive.slam.metric_since
+    before = [one for one in results if one.timestamp <= since and one.state == TrackingState.OK]
+    after = [one for one in results[: DARK.start] if one.timestamp > since]
+    assert len(before) > 10
+    assert all(one.n_features for one in before)
+    assert np.mean([one.n_features == 0 for one in after]) > 0.5
+
+
 def test_the_scale_does_not_depend_on_the_guess_and_its_error_is_known(drive):
     session, map_ = drive.slam._session, drive.slam.map
     inertial = session._motion.inertial_window()

@@ -55,6 +55,15 @@ class Context:
             return self.has_imu or not self.camera.monocular
         return method == "patches"
 
+    def awaits_scale(self, *, metric: bool) -> bool:
+        """Whether frames are tracked using features until the scale of one camera is known, because
+        it is found sooner and better if it drifts less (``tracks_patches``).
+
+        Args:
+            metric: whether the unit of the map is the metre.
+        """
+        return self.config.tracking.method == "auto" and self.camera.monocular and not metric
+
     @property
     def aligned_certainty(self) -> int:
         """Variance of a keypoint's position, divided by that of an aligned match or patch."""

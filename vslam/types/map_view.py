@@ -96,6 +96,7 @@ class MapView:
         offset_sigma: standard deviation of ``disparity_offset``, in pixels.
         part: index of the part of the map that contains the reference keyframe
             (``TrackResult.part``).
+        metric: whether the unit of a monocular map is the metre.
     """
 
     reference: int = 0
@@ -112,6 +113,7 @@ class MapView:
     disparity_offset: float = 0.0
     offset_sigma: float = 0.0
     part: int = 0
+    metric: bool = False
 
 
 def view_of(
@@ -149,4 +151,5 @@ def view_of(
         patch_stride=patch_stride,
         with_patches=LocalMap._make(values[at] for values in local),
         disparity_offset=map_.scalars.disparity_offset,
+        metric=map_.scalars.metric,
     )

@@ -33,7 +33,10 @@ _MIN_FOUND_RATIO = 0.25
 # III-D, printed]
 MIN_SHARED = 15
 
-INERTIAL_KEYFRAMES = 10  # newest keyframes that inertial factors connect
+# Newest keyframes that inertial factors connect. The other keyframes of the window are moved by
+# images alone and pull these with them: if only 10 are connected, the error of the rotation of
+# flights over one second doubles. The bound keeps the dense system small. [own]
+INERTIAL_KEYFRAMES = 30
 RECENT_KEYFRAMES = 3  # how long a landmark is on probation, in keyframes (ORB-SLAM, VI-B)
 
 

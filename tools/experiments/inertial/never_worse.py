@@ -1,8 +1,6 @@
 """Compare ordinary drives with and without the IMU: it must not make them worse.
 
-    python tools/experiments/inertial/never_worse.py --out never_worse.csv
-    python tools/experiments/inertial/never_worse.py --sensors stereo mono rgbd --seeds 60 61 \
-        --out sensors.csv
+    python tools/experiments/inertial/never_worse.py --seeds 60 61 --out sensors.csv
 
 Errors are those of the frames since the first one that was tracked, after a rigid alignment, also
 of one camera. ``scale_percent`` is by how much a similarity would scale the poses. ``lost`` counts
@@ -23,11 +21,8 @@ from drives import SYSTEMS, Drive, Run, ate, built_in, drive_of, rpe, scale_erro
 
 from vslam_lab.towns import Route, cache_folder
 
-DRIVES = (
-    ("room", 25), ("room", 26), ("hall", 25), ("hall", 26), ("walk", 25), ("walk", 26),
-    ("drone", 25), ("demo", 25), ("00", 25), ("03", 25),
-)  # fmt: skip
-OF_SENSORS = "room", "hall", "walk", "drone", "demo"
+ROUTES = "room", "hall", "walk", "drone", "demo"
+SENSORS = "stereo", "mono", "rgbd"
 SECONDS = 14.0
 
 
@@ -48,21 +43,18 @@ def main() -> None:
     parser.add_argument("--towns", type=Path, default=cache_folder())
     parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=["vslam"])
     parser.add_argument("--first", type=int, default=None, help="only the first drives")
-    parser.add_argument("--sensors", nargs="+", choices=("stereo", "mono", "rgbd"))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[60], help="with --sensors")
+    parser.add_argument("--sensors", nargs="+", choices=SENSORS, default=SENSORS)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[60])
     parser.add_argument("--repeats", type=int, default=1, help="runs of each drive")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     rows: list[dict[str, object]] = []
-    of_sensors = [(name, seed) for seed in options.seeds for name in OF_SENSORS]
-    drives, sensors = (of_sensors if options.sensors else DRIVES), options.sensors or ["stereo"]
-    for name, seed in drives[: options.first]:
+    for seed, name in list(product(options.seeds, ROUTES))[: options.first]:
         route = built_in(name, seed)
         frames = slice(0, round(SECONDS * route.rate))
-        for sensor in sensors:
-            made = "rgbd" if options.sensors else "stereo"  # all sensors share the images
-            drive = drive_of(route, seed, options.towns, frames=frames, sensor=made)
-            drive = replace(drive, sensor=sensor)
+        images = drive_of(route, seed, options.towns, frames=frames, sensor="rgbd")
+        for sensor in options.sensors:
+            drive = replace(images, sensor=sensor)
             settings = product(options.systems, (True, False), range(options.repeats))
             for system, imu, _ in settings:
                 run = SYSTEMS[system](drive, imu=imu)

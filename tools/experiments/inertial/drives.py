@@ -252,8 +252,8 @@ def scale_error(estimate: Float, truth: Float) -> float:
 
 
 def rpe(estimate: Float, truth: Float, frames: int) -> tuple[float, float]:
-    """Return the RMSE of the motions over a number of frames, in metres and degrees. They are NaN if
-    there are not so many frames."""
+    """Return the RMSE of the motions over a number of frames, in metres and degrees. Both are NaN
+    if there are not so many frames."""
     if len(truth) <= frames:
         return np.nan, np.nan
     pairs = [motion_error(estimate, truth, k, k + frames) for k in range(len(truth) - frames)]

@@ -216,7 +216,8 @@ def _values(root: Path, files: str, filters: str, column: str, row: list[str]) -
         if over == "each" and rows:
             found += [_parsed(one[operand]) for one in reversed(rows) if one.get(operand)]
         elif over in OVER_ROWS and rows:
-            found.append(OVER_ROWS[over]([float(one[operand]) for one in rows]))
+            known = [float(one[operand]) for one in rows if one[operand]]
+            found.append(OVER_ROWS[over](known))
         elif len(rows) != 1:
             raise LookupError(f"{len(rows)} rows of {files} have {wanted}")
         elif value := rows[0][name]:

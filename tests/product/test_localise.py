@@ -127,7 +127,8 @@ def test_going_on_extends_the_map_and_closes_the_ring(file, ring, check_map):
     places = [*range(90, LAP + 25)]
     results = drive(slam, ring, places, seed=4)
     check_map(slam.map)
-    assert states(results) == "O" * len(places)
+    assert set(states(results)) <= {"O", "W"}
+    assert states(results).count("W") <= 1
     assert results[0].relocalised
     assert not slam.map.restarts
     assert (slam.map.sessions[:n] == 0).all()

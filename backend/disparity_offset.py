@@ -15,8 +15,8 @@ information (inverse variance). A patch across the edge of an object takes over 
 of the object, so the errors of small disparities are skewed. The estimate therefore uses only the
 disparities that agree best with the motion.
 
-Most rectified pairs have no offset that matters, and to correct one that is not there makes the map
-as wrong as not to correct one that is. Therefore, the prior gives the same probability to no offset
+To correct an offset that is not there makes the map as wrong as not to correct one that is.
+Therefore, the prior gives the same probability to no offset
 and to a normally distributed one (Mitchell and Beauchamp, "Bayesian variable selection in linear
 regression", 1988). The posterior mean is added to the disparities.
 """

@@ -268,7 +268,6 @@ class PublishedMap:
         self.view = replace(
             view_of(map_, keyframe, local, patches, stride, monocular=monocular),
             part=part_of(map_, self._closing.closed, keyframe),
-            offset_sigma=map_.scalars.offset_sigma,
         )
 
     def refer_to_new(self, keyframe: int, track: Track) -> None:

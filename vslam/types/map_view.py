@@ -151,5 +151,6 @@ def view_of(
         patch_stride=patch_stride,
         with_patches=LocalMap._make(values[at] for values in local),
         disparity_offset=map_.scalars.disparity_offset,
+        offset_sigma=map_.scalars.offset_sigma,
         metric=map_.scalars.metric,
     )

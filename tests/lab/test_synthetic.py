@@ -7,6 +7,8 @@ import os
 import shutil
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -427,17 +429,30 @@ def test_another_calibration_is_another_sequence(tmp_path, monkeypatch):
         route_of_poses(straight(24), "short", "13")
 
 
-def test_two_processes_do_not_render_one_sequence(tmp_path, monkeypatch):
+def test_two_processes_do_not_render_one_sequence(tmp_path, monkeypatch, caplog):
     small = route_of_poses(straight(24), "short")
     monkeypatch.setattr(store, "render_frames", fake := Renderings())
     folder = tmp_path / store.folder_name(Variation()) / "sequences"
     folder.mkdir(parents=True)
-    with (
-        lock_of(folder / "short"),
-        pytest.raises(InputError, match="another process is rendering it; wait"),
-    ):
-        store.render_sequence(small, Variation(), tmp_path)
-    (folder / ".short.lock").touch()  # left by a killed process
+    with ThreadPoolExecutor(2) as pool:
+        with lock_of(folder / "short"):
+            waiting = [
+                pool.submit(store.render_sequence, small, Variation(), tmp_path) for _ in range(2)
+            ]
+            while len(caplog.records) < 2:
+                time.sleep(0.01)
+            assert "another process is rendering it; waiting" in caplog.text
+            assert fake.calls == 0
+        assert [each.result(timeout=60) for each in waiting] == [folder.parent] * 2
+    assert fake.calls == 1
+
+
+def test_the_lock_of_a_killed_process_keeps_nobody_out(tmp_path, monkeypatch):
+    small = route_of_poses(straight(24), "short")
+    monkeypatch.setattr(store, "render_frames", fake := Renderings())
+    folder = tmp_path / store.folder_name(Variation()) / "sequences"
+    folder.mkdir(parents=True)
+    (folder / ".short.lock").touch()
     store.render_sequence(small, Variation(), tmp_path)
     assert fake.calls == 1
     assert not list(folder.glob(".short*"))

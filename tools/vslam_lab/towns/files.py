@@ -80,13 +80,12 @@ def write_png(path: Path, image: NDArray[Any], level: int) -> None:
 
 
 def lock_of(folder: Path) -> AbstractContextManager[None]:
-    """Lock the folder of a sequence, so that no other process writes to this folder.
+    """Lock the folder of a sequence, so that no other process writes to it.
 
-    Raises:
-        InputError: another running process has locked the folder.
+    If another process has locked it, wait until that process is done.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
-    return locked(folder.with_name(f".{folder.name}.lock"), folder, "is rendering it")
+    return locked(folder.with_name(f".{folder.name}.lock"), folder, "is rendering it", wait=True)
 
 
 def check_disk(cache: Path, frames: int, depth: bool) -> None:

@@ -130,7 +130,8 @@ def render_sequence(
 ) -> Path:
     """Render the missing frames of a route in KITTI's format. Return the folder of the data set.
 
-    Damaged frames are rendered again, and a warning is logged.
+    Damaged frames are rendered again, and a warning is logged. While another process renders the
+    sequence, this one waits.
 
     Args:
         variation: variation of the town.
@@ -145,26 +146,27 @@ def render_sequence(
         on_frame: called with the number of finished frames and the number of all frames.
 
     Raises:
-        InputError: the folder cannot be written, the disk is too small, or another process is
-            rendering the sequence.
+        InputError: the folder cannot be written, or the disk is too small.
     """
     root = cache / folder_name(variation)
     folder = root / "sequences" / route.name
     wanted = _record_of(route, variation, depth)
     frames = len(route.T_wc)
     n = min(until or frames, frames)
-    found = _matching_record(folder, wanted, route.camera)
-    if found is not None and "checksums" in found:
-        if not (damaged := damaged_frames(folder, found, thorough=verify)):
-            return root
-        numbers = ", ".join(map(str, damaged[:5])) + (", ..." if len(damaged) > 5 else "")
-        count = counted(len(damaged), "damaged frame")
-        _log.warning("%s: rendering %s again: %s", folder, count, numbers)
-        missing, n = damaged, frames
-    else:
-        missing = list(range(n)) if found is None else _missing(folder, n, depth)
+    found, missing = _look(folder, wanted, route.camera, n, verify)
+    if _is_complete(found) and not missing:
+        return root
     check_disk(cache, len(missing), depth)
     with writing(cache), lock_of(folder):
+        # Another process may have rendered the sequence while this one waited for the lock.
+        found, missing = _look(folder, wanted, route.camera, n, verify)
+        if _is_complete(found):
+            if not missing:
+                return root
+            numbers = ", ".join(map(str, missing[:5])) + (", ..." if len(missing) > 5 else "")
+            count = counted(len(missing), "damaged frame")
+            _log.warning("%s: rendering %s again: %s", folder, count, numbers)
+            n = frames
         if found is None and folder.exists():
             shutil.rmtree(folder)
         for name in ("image_0", "image_1", *(("depth_0",) if depth else ())):
@@ -200,8 +202,21 @@ def _matching_record(folder: Path, wanted: dict[str, Any], camera: Camera) -> di
     return found if same else None
 
 
-def _missing(folder: Path, n: int, depth: bool) -> list[int]:
-    return [k for k in range(n) if not all(p.exists() for p in frame_files(folder, k, depth))]
+def _is_complete(record: dict[str, Any] | None) -> bool:
+    return record is not None and "checksums" in record
+
+
+def _look(
+    folder: Path, wanted: dict[str, Any], camera: Camera, n: int, verify: bool
+) -> tuple[dict[str, Any] | None, list[int]]:
+    """Return the record of a matching sequence, if there is one, and the frames to render."""
+    record = _matching_record(folder, wanted, camera)
+    if record is None:
+        return None, list(range(n))
+    if _is_complete(record):
+        return record, damaged_frames(folder, record, thorough=verify)
+    frames = [frame_files(folder, k, record["depth"]) for k in range(n)]
+    return record, [k for k, paths in enumerate(frames) if not all(p.exists() for p in paths)]
 
 
 def render_frames(

@@ -16,9 +16,9 @@ of the object, so the errors of small disparities are skewed. The estimate there
 disparities that agree best with the motion.
 
 To correct an offset that is not there makes the map as wrong as not to correct one that is.
-Therefore, the prior gives the same probability to no offset
-and to a normally distributed one (Mitchell and Beauchamp, "Bayesian variable selection in linear
-regression", 1988). The posterior mean is added to the disparities.
+Therefore, the prior gives a probability to no offset, and else a normal distribution (Mitchell and
+Beauchamp, "Bayesian variable selection in linear regression", 1988). The posterior mean is added to
+the disparities.
 """
 
 from __future__ import annotations
@@ -40,6 +40,10 @@ from vslam.types.map_kernels import collect_landmarks
 # The offset is estimated again after this many keyframes. [own]
 _OFFSET_KEYFRAMES = 12
 
+# Prior probability of an offset. Real pairs mostly have one, rendered ones have none. With 0.5,
+# half of the offset of KITTI 06 is used. With 1, short drives without an offset become 1.2 times as
+# wrong (docs/research/motorway.md). [own]
+PROBABILITY = 0.75
 TRIM = 2.0  # standard deviations about the median, within which disparities are used
 DEVIATION_OF_MEDIAN = 1.4826  # normal standard deviations per median deviation
 STEP = 0.2  # pixels between the three offsets for which the cost is computed
@@ -107,15 +111,16 @@ def found_offset(known: Scalars, found: float, information: float, config: Stere
 
 
 def posterior_offset(mean: float, variance: float, prior: float) -> tuple[float, float]:
-    """Compute the posterior mean and the standard deviation of the offset. A priori, the offset is
-    zero with a probability of one half, and else it is normally distributed with mean 0.
+    """Compute the posterior mean and the standard deviation of the offset. A priori, there is an
+    offset with the probability ``PROBABILITY``, and it is normally distributed with mean 0.
 
     Args:
         mean, variance: of the estimate, in pixels and squared pixels.
         prior: variance of an offset that is not zero, in squared pixels.
     """
     share = prior / (prior + variance)
-    odds = sqrt(1.0 - share) * exp(min(0.5 * share * mean**2 / variance, 100.0))
+    ratio = sqrt(1.0 - share) * exp(min(0.5 * share * mean**2 / variance, 100.0))
+    odds = PROBABILITY / (1.0 - PROBABILITY) * ratio
     probability = odds / (1.0 + odds)
     offset = probability * share * mean
     second_moment = probability * (share * variance + (share * mean) ** 2)

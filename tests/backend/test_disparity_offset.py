@@ -91,7 +91,7 @@ def test_an_offset_within_its_noise_is_not_believed() -> None:
     sigma = np.sqrt(VARIANCE / 5000.0)
     known = known_after([1.5 * sigma], 5000.0)
     assert known.offset_mean == pytest.approx(1.5 * sigma)
-    assert 0.0 < known.disparity_offset < 0.4 * known.offset_mean
+    assert 0.0 < known.disparity_offset < 0.6 * known.offset_mean
 
 
 def test_an_offset_far_above_its_noise_is_added_whole() -> None:
@@ -105,7 +105,7 @@ def test_windows_that_contradict_each_other_are_believed_less() -> None:
     together = known_after([0.06, 0.06, 0.06, 0.06], 5000.0)
     apart = known_after([-0.14, 0.26, -0.14, 0.26], 5000.0)
     assert apart.offset_mean == pytest.approx(together.offset_mean)
-    assert apart.disparity_offset < 0.3 * together.disparity_offset
+    assert apart.disparity_offset < 0.5 * together.disparity_offset
     assert apart.offset_sigma > 2.0 * together.offset_sigma
 
 

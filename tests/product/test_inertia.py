@@ -17,6 +17,7 @@ from vslam.method.inertia import (
     IMU_REFUSED,
     KEPT_S,
     gravity_direction,
+    is_refused,
     is_stuck,
     lost,
     moves,
@@ -179,6 +180,25 @@ def test_a_fast_and_slow_camera_agrees_with_its_imu(step):
         inertia = tracked(inertia, predicted, t, T, covariance, calibration, stands_still=False)
         before = t + 1e-6
     assert inertia.disagreements == 0
+    assert inertia.state is not None
+
+
+def test_one_wrong_pose_of_a_slow_camera_does_not_refuse_the_imu():
+    """At two frames a second, one wrong pose is part of several starts."""
+    sound = Walk(6)
+    rows = sound.samples(np.arange(-0.05, 9.0, 0.005), BIAS, ADIS16448)
+    calibration = ImuCalibration(np.eye(4), ADIS16448)
+    inertia = Inertia()
+    for k in range(18):
+        t = 0.5 * k
+        new = (rows[:, 0] > t - 0.5) & (rows[:, 0] <= t)
+        inertia = with_samples(inertia, rows[new])
+        T = inverse(sound.pose(0.0)) @ sound.pose(t)
+        T[0, 3] += 0.5 * (k == 3)
+        predicted = predicted_state(inertia, t, calibration)
+        covariance = np.diag([0.003**2] * 3 + [0.0005**2] * 3)
+        inertia = tracked(inertia, predicted, t, T, covariance, calibration, stands_still=False)
+    assert not is_refused(inertia)
     assert inertia.state is not None
 
 

@@ -48,9 +48,10 @@ from vslam.types.imu import (
 from vslam.types.odometry import KEYFRAME_DRIFT
 
 CARRIED_S = 3.0  # s without images after which a pose counts as lost, not as carried by the IMU
-# The start needs poses over START_S seconds. It is tried again every RETRY_S seconds, with the
-# poses of the last STRETCH_S seconds, of which at most MOST_POSES are used. Of a slow camera, the
-# last FEWEST_POSES poses are used, if they are at most LONGEST_S seconds old.
+# The start needs poses over START_S seconds. It is tried again when the share RETRY_SHARE of the
+# time of these poses is new, at least after RETRY_S seconds, with the poses of the last STRETCH_S
+# seconds, of which at most MOST_POSES are used. Of a slow camera, the last FEWEST_POSES poses are
+# used, if they are at most LONGEST_S seconds old.
 START_S, RETRY_S, STRETCH_S, MOST_POSES = 0.5, 0.25, 1.0, 20
 FEWEST_POSES, LONGEST_S = 6, 4.0
 KEPT_S = 5.0  # s for which samples are kept
@@ -427,7 +428,8 @@ def _started(inertia: Inertia, noise: Matrix, calibration: ImuCalibration) -> In
     ``noise``."""
     times = inertia.times
     now = float(times[-1])
-    if now - times[0] < START_S or now - inertia.tried < RETRY_S:
+    pause = max(RETRY_S, RETRY_SHARE * (now - times[0]))
+    if now - times[0] < START_S or now - inertia.tried < pause:
         return inertia
     inertia = replace(inertia, tried=now)
     step = -(-len(times) // MOST_POSES)

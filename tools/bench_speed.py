@@ -3,12 +3,18 @@
     python tools/bench_speed.py --case "KITTI 00=/data/kitti:00:216" [--also="--detector both"] \
         [--repeats 3] [--orbslam3-python PY --vocabulary voc.txt] --csv speed.csv
 
-A case is a folder in KITTI's format, a sequence in it and a number of frames. The systems run
-alternately, and never at the same time. The first round is not counted. In each round, vslam runs
-with its report, with ``--no-report``, and with ``--no-report`` and the options of each ``--also``.
+A case is a folder in KITTI's format, a sequence in it and a number of frames, ``DATA:SEQ:FRAMES``.
+With ``:mono`` at its end, only the left images are used. A case ``DATA::FRAMES:rgbd`` is a folder
+of TUM's RGB-D data.
 
-The wall time, CPU time and peak memory are those of whole processes. The errors of all systems are
-computed from their trajectory files.
+The systems run alternately, and never at the same time. The first round is not counted. In each
+round, vslam runs with its report, with ``--no-report``, and with ``--no-report`` and the options of
+each ``--also``.
+
+The wall time, CPU time and peak memory are those of whole processes. ORB-SLAM3 gets the images of
+one camera no faster than the camera took them, and the time that it waits for them is not counted.
+It reads RGB-D images and those of one camera from PNG files, whose distortion is corrected. The
+errors of all systems are computed from their trajectory files, those of one camera with a scale.
 """
 
 from __future__ import annotations
@@ -31,6 +37,21 @@ VSLAM = str(Path(sys.executable).with_name("vslam"))
 SCRIPT = Path(__file__).parent / "vslam_lab" / "stress" / "orbslam3.py"
 LOOP_MESSAGE = "*Loop detected"  # ORB-SLAM3 prints it once for each loop that it closes
 FULL, LEAN, ORBSLAM3 = "vslam", "vslam --no-report", "ORB-SLAM3"
+_IMAGES = {"stereo": ("image_0", "image_1"), "mono": ("image_0",), "rgbd": ("rgb", "depth")}
+_TRUTH = ("poses", "groundtruth.txt")
+# Runs in a process of its own, because the caller must not import large packages (measure).
+_EXPORT = """
+import sys
+from pathlib import Path
+
+from bench_speed import Case, opened
+from vslam.datasets.perturbation import Perturbation
+from vslam_lab.stress.external import export_kitti
+
+data, seq, frames, sensor, folder = sys.argv[1:]
+source = opened(Case("", Path(data), seq, int(frames), sensor))
+export_kitti(source, Perturbation("none"), Path(folder))
+"""
 MEASURES = {  # columns and formats
     "process_fps": ".1f",
     "loop_fps": ".1f",
@@ -45,12 +66,14 @@ MEASURES = {  # columns and formats
 
 
 class Case(NamedTuple):
-    """The first ``frames`` frames of a sequence in KITTI's format."""
+    """The first ``frames`` frames of a sequence: in KITTI's format if the sensor is ``stereo`` or
+    ``mono``, and in TUM's if it is ``rgbd``."""
 
     title: str
     data: Path
     seq: str
     frames: int
+    sensor: str = "stereo"
 
 
 class OrbSlam3(NamedTuple):
@@ -108,15 +131,19 @@ def measure(command: list[str], folder: Path) -> Process:
 
 
 def parse_case(text: str) -> Case:
-    """Parse the text of a case, ``TITLE=DATA:SEQ:FRAMES``."""
+    """Parse the text of a case, ``TITLE=DATA:SEQ:FRAMES`` or ``TITLE=DATA:SEQ:FRAMES:SENSOR``."""
     title, separator, place = text.partition("=")
+    place, _, sensor = place.rpartition(":")
+    if sensor not in _IMAGES:
+        place, sensor = f"{place}:{sensor}", "stereo"
     parts = place.rsplit(":", 2)
     if not separator or len(parts) != 3 or not parts[2].isdecimal():
-        raise argparse.ArgumentTypeError(f"{text}: write TITLE=DATA:SEQ:FRAMES")
-    case = Case(title, Path(parts[0]).absolute(), parts[1], int(parts[2]))
-    sides = [case.data / "sequences" / case.seq / f"image_{side}" for side in (0, 1)]
+        raise argparse.ArgumentTypeError(f"{text}: write TITLE=DATA:SEQ:FRAMES[:SENSOR]")
+    case = Case(title, Path(parts[0]).absolute(), parts[1], int(parts[2]), sensor)
+    sequence = case.data if sensor == "rgbd" else case.data / "sequences" / case.seq
+    sides = [sequence / name for name in _IMAGES[sensor]]
     if missing := [side for side in sides if not side.is_dir()]:
-        raise argparse.ArgumentTypeError(f"{missing[0]}: no such folder; give a KITTI sequence")
+        raise argparse.ArgumentTypeError(f"{missing[0]}: no such folder; give a {sensor} sequence")
     here = min(len(list(side.iterdir())) for side in sides)
     if not 2 <= case.frames <= here:
         raise argparse.ArgumentTypeError(f"{text}: FRAMES must be from 2 to {here}")
@@ -132,10 +159,15 @@ def run_vslam(case: Case, folder: Path, *words: str) -> Run:
     """
     data = case.data
     if "--no-report" in words:
-        data = folder / "data"
+        data = folder / case.data.name  # the name of TUM's folders tells their calibration
         data.mkdir()
-        (data / "sequences").symlink_to(case.data / "sequences")
-    command = [VSLAM, "run", "--data", str(data), "--seq", case.seq, "--no-record", "--quiet"]
+        for path in case.data.iterdir():
+            if path.name not in _TRUTH:
+                (data / path.name).symlink_to(path)
+    chosen = [] if case.sensor == "rgbd" else ["--seq", case.seq]
+    if case.sensor == "mono":
+        chosen += ["--sensor", "mono"]
+    command = [VSLAM, "run", "--data", str(data), *chosen, "--no-record", "--quiet"]
     command += ["--max-frames", str(case.frames), "--out", "runs", "--detector", "bow"]
     process = measure([*command, *words], folder)
     results = folder / "runs" / "latest"
@@ -144,11 +176,23 @@ def run_vslam(case: Case, folder: Path, *words: str) -> Run:
     return Run(process, report, report["lost_frames"], report["loops_closed"], file)
 
 
-def run_orbslam3(case: Case, system: OrbSlam3, folder: Path) -> Run:
+def exported(case: Case, scratch: str) -> Path:
+    """Return the folder that ORB-SLAM3 reads. That of a stereo camera is the folder of the case."""
+    if case.sensor == "stereo":
+        return case.data / "sequences" / case.seq
+    folder = Path(tempfile.mkdtemp(dir=scratch)) / "sequence"
+    command = [sys.executable, "-c", _EXPORT, str(case.data), case.seq, str(case.frames)]
+    here = Path(__file__).parent  # where this module can be imported
+    subprocess.run([*command, case.sensor, str(folder)], check=True, cwd=here)
+    return folder
+
+
+def run_orbslam3(case: Case, images: Path, system: OrbSlam3, folder: Path) -> Run:
     command = [str(system.python), str(SCRIPT), str(system.vocabulary)]
-    command += [str(case.data / "sequences" / case.seq), "out", "--frames", str(case.frames)]
+    command += [str(images), "out", "--frames", str(case.frames)]
     process = measure(command, folder)
     report = json.loads((folder / "out" / "costs.json").read_text())
+    process = process._replace(wall_s=process.wall_s - report["waited_s"])
     loops = process.output.count(LOOP_MESSAGE)
     return Run(process, report, report["lost"], loops, folder / "out" / "trajectory.txt")
 
@@ -167,12 +211,13 @@ def measure_case(
     if orbslam3 is None:
         del words[ORBSLAM3]
     runs: dict[str, list[Run]] = {system: [] for system in words}
+    images = exported(case, scratch) if orbslam3 else case.data
     for repeat in range(repeats + 1):
         for system, done in runs.items():
             folder = Path(tempfile.mkdtemp(dir=scratch))
             if system == ORBSLAM3:
                 assert orbslam3 is not None
-                run = run_orbslam3(case, orbslam3, folder)
+                run = run_orbslam3(case, images, orbslam3, folder)
             else:
                 run = run_vslam(case, folder, *words[system])
             counted = f"{repeat} of {repeats}" if repeat else "not counted"
@@ -182,13 +227,21 @@ def measure_case(
     return runs
 
 
+def opened(case: Case) -> Any:
+    """Open the images of a case as a `Source`."""
+    from vslam.datasets import open_sequence
+
+    dataset = "tum" if case.sensor == "rgbd" else "kitti"
+    mono = case.sensor == "mono"
+    return open_sequence(dataset, case.data, case.seq, max_frames=case.frames, monocular=mono)
+
+
 def measures(run: Run, case: Case) -> dict[str, float]:
     import numpy as np
 
-    from vslam.datasets import open_sequence
     from vslam.evaluation.trajectories import evaluate_trajectory
+    from vslam.run.outcome import ground_truth_of
     from vslam.support.errors import InputError
-    from vslam.types.trajectory import Trajectory
     from vslam_lab.stress.external import read_poses
 
     process, frames = run.process, run.report["frames"]
@@ -203,13 +256,14 @@ def measures(run: Run, case: Case) -> dict[str, float]:
         "ate_m": float("nan"),
         "rpe_m": float("nan"),
     }
-    sequence = open_sequence("kitti", case.data, case.seq, max_frames=case.frames)
-    if sequence.ground_truth is not None:
+    sequence = opened(case)
+    if (truth := ground_truth_of(sequence)) is not None:
         times = sequence.timestamps
         with suppress(InputError):  # too few frames have a pose
             # Frames without a pose get an interpolated pose, as in ``vslam stress``.
             estimate = read_poses(run.trajectory, times, np.arange(len(times))).bridged(times)
-            errors = evaluate_trajectory(estimate, Trajectory(times, sequence.ground_truth))
+            alignment = "sim3" if case.sensor == "mono" else "se3"
+            errors = evaluate_trajectory(estimate, truth, alignment)
             found |= {"ate_m": errors.ate_rmse_m, "rpe_m": errors.rpe_m}
     return found
 
@@ -242,7 +296,7 @@ def orbslam3_of(options: argparse.Namespace) -> OrbSlam3 | None:
 
 def parse_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    shape = "TITLE=DATA:SEQ:FRAMES"
+    shape = "TITLE=DATA:SEQ:FRAMES[:SENSOR]"
     parser.add_argument("--case", type=parse_case, action="append", required=True, metavar=shape)
     parser.add_argument("--repeats", type=int, default=3, help="counted runs of each system")
     parser.add_argument(

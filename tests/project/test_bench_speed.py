@@ -22,8 +22,15 @@ def speed(monkeypatch):
 
 def test_a_case_is_a_title_and_a_place(speed, kitti_tree, tmp_path):
     case = speed.parse_case(f"a town={kitti_tree}:00:28")
-    assert case == ("a town", kitti_tree, "00", 28)
-    for wrong in ("no place", f"t={kitti_tree}:00", f"t={kitti_tree}:00:all", "t=/nowhere:00:5"):
+    assert case == ("a town", kitti_tree, "00", 28, "stereo")
+    assert speed.parse_case(f"a town={kitti_tree}:00:28:mono") == (*case[:4], "mono")
+    for wrong in (
+        "no place",
+        f"t={kitti_tree}:00",
+        f"t={kitti_tree}:00:all",
+        "t=/nowhere:00:5",
+        f"t={kitti_tree}:00:28:depth",
+    ):
         with pytest.raises(argparse.ArgumentTypeError):
             speed.parse_case(wrong)
     (tmp_path / "sequences" / "00" / "image_0").mkdir(parents=True)

@@ -1,18 +1,23 @@
 """Start monocular maps on rendered drives, and compare the rotation errors with those of stereo.
 
     python tools/experiments/monocular/starts.py --seeds 81 82 83 --out starts.csv
+    python tools/experiments/monocular/starts.py --orbslam3 PYTHON VOCABULARY --out orbslam3.csv
 
 ``rpe_deg`` is the RMSE of the rotation from frame to frame, in degrees, over all frames whose pose
 the monocular run has found, and ``rpe_deg_stereo`` that of stereo over the same frames. ``ratio``
 is the first divided by the second. ``first_s`` is the time of the first keyframe pair, and
 ``untracked`` the number of frames without a pose at the end. Nothing but these numbers is known of
 a drive in which no map begins.
+
+With ``--orbslam3``, the drives are tracked by ORB-SLAM3 with one camera.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import subprocess
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,10 +28,13 @@ from scipy.spatial.transform import Rotation
 
 from vslam.datasets.frames import Source
 from vslam.datasets.kitti import open_kitti
+from vslam.datasets.perturbation import Perturbation
 from vslam.evaluation.trajectories import ate_rmse
 from vslam.slam import Slam
 from vslam.types.geometry import inverses
 from vslam.types.trajectory import Trajectory
+from vslam_lab.stress import orbslam3
+from vslam_lab.stress.external import Poses, export_kitti, read_poses
 from vslam_lab.towns import Route, Variation, cache_folder, render_sequence, route_named
 
 Float = NDArray[np.float64]
@@ -135,27 +143,61 @@ def rms(values: Float) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else np.nan
 
 
-def row(family: str, seed: int, cache: Path) -> dict[str, object]:
+def rendered(family: str, seed: int, cache: Path, *, mono: bool) -> tuple[Route, Source]:
     route = FAMILIES[family](seed)
     root = render_sequence(route, Variation(seed=seed), cache)
-    source = open_kitti(root, route.name)
+    return route, open_kitti(root, route.name, monocular=mono)
+
+
+def row(family: str, seed: int, cache: Path) -> dict[str, object]:
+    route, source = rendered(family, seed, cache, mono=False)
     mono = run(source, mono=True)
     known, map_ = mono.tracked(), mono.map
-    both = known[1:] & known[:-1]
     begun = map_.n_keyframes > 0
-    runs = (mono, run(source, mono=False)) if begun else ()
-    errors = [rms(rotation_errors(one.trajectory().T_wc, route.ground_truth)[both]) for one in runs]
-    rpe, rpe_stereo = errors or (np.nan, np.nan)
-    ate = np.nan
-    if begun and known.sum() > 3:
-        found = mono.trajectory().select(np.flatnonzero(known))
-        truth = Trajectory(found.timestamps, route.ground_truth[known])
-        ate = ate_rmse(found, truth, "sim3")
+    poses = Poses(mono.trajectory().T_wc, known)
+    rpe, ate = errors(poses, route) if begun else (np.nan, np.nan)
+    stereo = np.nan
+    if begun:
+        stereo, _ = errors(Poses(run(source, mono=False).trajectory().T_wc, known), route)
     return {
         "family": family, "route": route.name, "seed": seed, "frames": len(route.T_wc),
         "first_s": float(route.timestamps[map_.frames[1]]) if begun else np.nan,
         "untracked": int((~known).sum()), "parts": len({0, *map_.restarts}) if begun else 0,
-        "ate_m": ate, "rpe_deg": rpe, "rpe_deg_stereo": rpe_stereo, "ratio": rpe / rpe_stereo,
+        "ate_m": ate, "rpe_deg": rpe, "rpe_deg_stereo": stereo, "ratio": rpe / stereo,
+    }  # fmt: skip
+
+
+def errors(poses: Poses, route: Route) -> tuple[float, float]:
+    """Return the RMSE of the rotation from frame to frame in degrees, and the ATE in metres after
+    a similarity, over the known poses."""
+    known, ate = poses.known, np.nan
+    both = known[1:] & known[:-1]
+    rpe = rms(rotation_errors(poses.T_wc, route.ground_truth)[both])
+    if known.sum() > 3:
+        times = route.timestamps[known]
+        found = Trajectory(times, poses.T_wc[known])
+        ate = ate_rmse(found, Trajectory(times, route.ground_truth[known]), "sim3")
+    return rpe, ate
+
+
+def orbslam3_row(
+    family: str, seed: int, cache: Path, python: str, vocabulary: str
+) -> dict[str, object]:
+    route, source = rendered(family, seed, cache, mono=True)
+    with tempfile.TemporaryDirectory(prefix="orbslam3-") as name:
+        images, out = Path(name) / "images", Path(name) / "out"
+        kept, _ = export_kitti(source, Perturbation("none"), images)
+        command = [python, str(orbslam3.__file__), vocabulary, str(images), str(out)]
+        # The script ends when its standard input is closed.
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        ) as child:
+            child.wait()
+        poses = read_poses(out / "trajectory.txt", source.timestamps, kept)
+    rpe, ate = errors(poses, route)
+    return {
+        "family": family, "route": route.name, "seed": seed, "frames": len(route.T_wc),
+        "untracked": int((~poses.known).sum()), "ate_m": ate, "rpe_deg": rpe,
     }  # fmt: skip
 
 
@@ -164,12 +206,16 @@ def main() -> None:
     parser.add_argument("--families", nargs="+", choices=FAMILIES, default=list(FAMILIES))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(81, 86)))
     parser.add_argument("--towns", type=Path, default=cache_folder())
+    parser.add_argument("--orbslam3", nargs=2, metavar=("PYTHON", "VOCABULARY"))
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     rows = []
     for family in options.families:
         for seed in options.seeds:
-            rows.append(row(family, seed, options.towns))
+            if options.orbslam3:
+                rows.append(orbslam3_row(family, seed, options.towns, *options.orbslam3))
+            else:
+                rows.append(row(family, seed, options.towns))
             print(
                 {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in rows[-1].items()},
                 flush=True,

@@ -120,6 +120,7 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
         "track_ms_p95": float(np.percentile(track_ms, 95)),
         "lost": states.count("LOST"),
         "wall_s": wall_s,
+        "waited_s": waited_s,
         "cpu_s": cpu_s,
     }
     slam.shutdown()

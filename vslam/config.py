@@ -326,6 +326,9 @@ class RelocalizationConfig(Section):
 class LoopConfig(Section):
     """Closing a verified loop, and global bundle adjustment afterwards [OS1, VII]."""
 
+    kidnapped: float = Field(1e-3, ge=0)
+    """A loop that is right only if the camera was carried away while it was lost is closed only if
+    the probability that the loop is wrong is at most this. [own]"""
     overwhelming: float = Field(1e-6, ge=0)
     """A loop that contradicts the odometry is closed nevertheless if the probability that the loop
     is wrong is at most this. [own]"""

@@ -362,6 +362,16 @@ def test_a_camera_is_taken_for_kidnapped_only_if_it_cannot_have_gone_on_as_predi
     assert correction.T_cw_after.tobytes() == solutions[expected].T_cw.tobytes()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("gap", "closed"), [("dark", 1), ("carried", 0)])
+def test_a_doubtful_loop_does_not_carry_the_camera_away(gap, closed):
+    map_, edge = copy.deepcopy(open_loop(gap))
+    edge = replace(edge, p_wrong=2e-3)
+    closing = closing_of(edge, Config())
+    closing.consider(map_, edge.query, [LoopCandidate(edge.query, edge.match, 1.0)])
+    assert len(closing.corrections) == closed
+
+
 def test_a_map_in_one_piece_has_no_gaps():
     slam, edge = closed(), closed().corrections[0].edge
     config = Config().pose_graph

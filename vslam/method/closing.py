@@ -245,7 +245,8 @@ class LoopClosing:
         """
         start = time.perf_counter()
         solution = self._solution(map_, edge, Hypothesis.PREDICTED)
-        if not solution.verdict.consistent and solution.has_gaps:
+        carried = solution.has_gaps and edge.p_wrong <= self._config.loops.kidnapped
+        if not solution.verdict.consistent and carried:
             solution = self._solution(map_, edge, Hypothesis.KIDNAPPED)
         refused, certain = solution.verdict.reason, self._config.loops.overwhelming
         against = not solution.verdict.consistent and edge.p_wrong <= certain

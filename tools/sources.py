@@ -10,7 +10,7 @@ The fields of a line, separated by ``|``, are:
 - The CSV file, or several files separated by ``+``, whose rows are joined.
 - A filter that selects a row of the file. ``$1`` stands for the text of the first cell of the
   table's row. If a part of this text is in backticks, ``$1`` stands for that part. ``$0`` stands
-  for the head of the column.
+  for the head of the column. ``x=1 or 2`` allows several values.
 - A field for each further cell of the table's row. The field lists columns of the file. The cell
   must show the values of these columns, rounded as in the cell. The last field also applies to all
   further cells. If a field is empty, its cell is not compared. A filter in parentheses applies to
@@ -211,7 +211,9 @@ def _values(root: Path, files: str, filters: str, column: str, row: list[str]) -
         name, _, more = field.strip().removesuffix(")").partition(" (")
         in_parentheses = more or in_parentheses
         wanted = _wanted(f"{filters}, {in_parentheses}", row)
-        rows = [one for one in table if wanted.items() <= one.items()]
+        rows = [
+            one for one in table if all(one.get(key) in any_of for key, any_of in wanted.items())
+        ]
         over, _, operand = name.partition(" ")
         if over == "each" and rows:
             found += [_parsed(one[operand]) for one in reversed(rows) if one.get(operand)]
@@ -219,7 +221,8 @@ def _values(root: Path, files: str, filters: str, column: str, row: list[str]) -
             known = [float(one[operand]) for one in rows if one[operand]]
             found.append(OVER_ROWS[over](known))
         elif len(rows) != 1:
-            raise LookupError(f"{len(rows)} rows of {files} have {wanted}")
+            shown = {key: " or ".join(any_of) for key, any_of in wanted.items()}
+            raise LookupError(f"{len(rows)} rows of {files} have {shown}")
         elif value := rows[0][name]:
             found.append(_parsed(value))
     return found[::-1]
@@ -229,8 +232,8 @@ def _parsed(value: str) -> float | str:
     return float(value) if NUMBER.fullmatch(value) else value
 
 
-def _wanted(filters: str, row: list[str]) -> dict[str, str]:
-    """Return the wanted value of each column of a filter. ``$1`` stands for the text ``row[1]``."""
+def _wanted(filters: str, row: list[str]) -> dict[str, list[str]]:
+    """Return the values that a filter allows for each column. ``$1`` stands for ``row[1]``."""
 
     def text(found: re.Match[str]) -> str:
         cell = row[int(found[1])]
@@ -238,4 +241,4 @@ def _wanted(filters: str, row: list[str]) -> dict[str, str]:
         return code[1] if code else cell.strip("*")
 
     pairs = [one.split("=", 1) for one in re.split(r", (?=\w+=)", filters.strip(", "))]
-    return {key: re.sub(r"\$(\d)", text, value) for key, value in pairs}
+    return {key: re.sub(r"\$(\d)", text, value).split(" or ") for key, value in pairs}

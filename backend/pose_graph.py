@@ -45,6 +45,9 @@ _GAP_SPEED = 2.0
 _GAP_ROTATION = 0.3
 # A gap shorter than this counts as this long, in seconds. [own]
 _MIN_GAP = 0.3
+# Focal length to which ``PoseGraphConfig.rotation_drift`` refers, in pixels. It is about that of
+# KITTI, with which it was chosen.
+_FOCAL_LENGTH = 700.0
 # Upper bound of the number of Levenberg-Marquardt iterations. [own]
 _ITERATIONS = 50
 
@@ -251,6 +254,16 @@ def edge_sigmas(
     sigmas[kind == WEAK] = _WEAK_TRANSLATION, _WEAK_ROTATION
     sigmas[kind == LOOP] = _LOOP_TRANSLATION, _LOOP_ROTATION
     return np.repeat(sigmas, 3, axis=1)
+
+
+def drift_of_camera(config: PoseGraphConfig, focal_length: float) -> PoseGraphConfig:
+    """Return the configuration for a camera with a focal length, in pixels.
+
+    A pixel of a shorter focal length is a larger angle, so the rotation drifts more. A longer one
+    changes nothing, because the calibration then limits the accuracy.
+    """
+    rotation_drift = config.rotation_drift * max(1.0, _FOCAL_LENGTH / focal_length)
+    return config.model_copy(update={"rotation_drift": rotation_drift})
 
 
 def parts_of(edges: NDArray[np.int64], n: int) -> NDArray[np.int64]:

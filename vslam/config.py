@@ -374,7 +374,8 @@ class PoseGraphConfig(Section):
     translation_drift: float = Field(0.03, gt=0)
     """Standard deviation of translational drift, in metres per square root of a metre. [own]"""
     rotation_drift: float = Field(0.001, gt=0)
-    """Standard deviation of rotational drift, in radians per square root of a metre. [own]"""
+    """Standard deviation of rotational drift, in radians per square root of a metre, with a focal
+    length of at least 700 pixels. It is inversely proportional to shorter ones. [own]"""
     loop_inflation: float = Field(1.5, gt=0)
     """Factor on the covariance of a verified loop, which lacks the errors of the landmarks
     (docs/research/uncertainty.md). [own]"""

@@ -15,6 +15,7 @@ from vslam.backend.pose_graph import (
     WEAK,
     PoseGraph,
     check_pose_graph,
+    drift_of_camera,
     edge_errors,
     edge_sigmas,
     essential_graph,
@@ -358,6 +359,13 @@ def test_a_tree_edge_past_a_restart_with_landmarks_in_common_is_not_weak():
     map_.begin_submap(4, 3, predicted=True)
     edges = named(essential_graph(map_, [], CONFIG))
     assert WEAK not in edges.values()
+
+
+@pytest.mark.parametrize(("focal_length", "factor"), [(350.0, 2.0), (700.0, 1.0), (1400.0, 1.0)])
+def test_a_camera_with_a_short_focal_length_turns_less_exactly(focal_length, factor):
+    config = drift_of_camera(CONFIG, focal_length)
+    assert config.rotation_drift == pytest.approx(factor * CONFIG.rotation_drift)
+    assert config.translation_drift == CONFIG.translation_drift
 
 
 def test_each_unconnected_part_is_held():

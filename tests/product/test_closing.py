@@ -12,7 +12,14 @@ from ring import CAMERA, LAP, Oracle, Ring
 
 from vslam.backend import pose_graph
 from vslam.backend.loop_correction import move_keyframes
-from vslam.backend.pose_graph import GAP, WEAK, connectivity, essential_graph, optimise
+from vslam.backend.pose_graph import (
+    GAP,
+    WEAK,
+    connectivity,
+    drift_of_camera,
+    essential_graph,
+    optimise,
+)
 from vslam.backend.similarity_graph import scale_of
 from vslam.config import Config, ConsistencyConfig, KeyframeConfig, LoopConfig
 from vslam.loopclosure.detector import NoDetector
@@ -342,8 +349,9 @@ def test_a_camera_is_taken_for_kidnapped_only_if_it_cannot_have_gone_on_as_predi
     map_, edge = copy.deepcopy(open_loop(gap))
     if unpredicted:
         map_.keyframes.restart[map_.restarts] = UNPREDICTED
+    drift = drift_of_camera(config.pose_graph, CAMERA.fx)
     solutions = {
-        one: solve(map_, [], edge, one, config.pose_graph, monocular=False)
+        one: solve(map_, [], edge, one, drift, monocular=False)
         for one in (Hypothesis.PREDICTED, Hypothesis.KIDNAPPED)
     }
     kinds = {one: set(found.graph.kind) & {GAP, WEAK} for one, found in solutions.items()}

@@ -26,6 +26,7 @@ from vslam.backend.global_bundle_adjustment import adjust_globally
 from vslam.backend.global_mapping import GlobalSnapshot, apply_solution, take_snapshot
 from vslam.backend.local_mapping import adjust_locally, strong_neighbours
 from vslam.backend.loop_correction import move_keyframes
+from vslam.backend.pose_graph import drift_of_camera
 from vslam.backend.similarity_graph import (
     loop_in_new_units,
     move_keyframes_similarly,
@@ -84,6 +85,7 @@ class LoopClosing:
         self._context = context
         self._camera = context.camera
         self._config = context.config
+        self._pose_graph = drift_of_camera(context.config.pose_graph, context.camera.fx)
         state = state or ClosingState()
         memory = verifier.verified_memory
         self._consistency = LoopConsistency(context, memory, state.consistency)
@@ -285,7 +287,7 @@ class LoopClosing:
             self.closed,
             edge,
             hypothesis,
-            self._config.pose_graph,
+            self._pose_graph,
             monocular=self._camera.monocular,
         )
 

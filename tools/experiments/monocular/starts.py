@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-import subprocess
+import shlex
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -34,7 +34,7 @@ from vslam.slam import Slam
 from vslam.types.geometry import inverses
 from vslam.types.trajectory import Trajectory
 from vslam_lab.stress import orbslam3
-from vslam_lab.stress.external import Poses, export_kitti, read_poses
+from vslam_lab.stress.external import Poses, call, export_kitti, read_poses
 from vslam_lab.towns import Route, Variation, cache_folder, render_sequence, route_named
 
 Float = NDArray[np.float64]
@@ -187,12 +187,8 @@ def orbslam3_row(
     with tempfile.TemporaryDirectory(prefix="orbslam3-") as name:
         images, out = Path(name) / "images", Path(name) / "out"
         kept, _ = export_kitti(source, Perturbation("none"), images)
-        command = [python, str(orbslam3.__file__), vocabulary, str(images), str(out)]
-        # The script ends when its standard input is closed.
-        with subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        ) as child:
-            child.wait()
+        words = shlex.join([python, str(orbslam3.__file__), vocabulary])
+        call(f"{words} {{folder}} {{out}}", images, out)
         poses = read_poses(out / "trajectory.txt", source.timestamps, kept)
     rpe, ate = errors(poses, route)
     return {

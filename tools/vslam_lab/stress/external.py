@@ -110,7 +110,7 @@ def run_external(
         out.mkdir()
         kept, unreadable = export_kitti(sequence, perturbation, work / "sequence")
         start = time.perf_counter()
-        _call(template, work / "sequence", out)
+        call(template, work / "sequence", out)
         wall = time.perf_counter() - start
         outcome = _outcome(sequence, settings, kept, unreadable, out, wall)
     report = write_results(folder, outcome, pages=False)
@@ -173,7 +173,15 @@ def _millimetres(depth: NDArray[np.generic]) -> NDArray[np.uint16]:
     return np.where((rounded > 0) & (rounded < 2**16), rounded, 0).astype(np.uint16)
 
 
-def _call(template: str, sequence: Path, out: Path) -> None:
+def call(template: str, sequence: Path, out: Path) -> None:
+    """Run the command of another SLAM system on a folder in KITTI's format.
+
+    Args:
+        template: the command, with ``{folder}`` and ``{out}``.
+
+    Raises:
+        InputError: the command cannot be started, crashes or exits with an error.
+    """
     words = shlex.split(
         template.format(folder=shlex.quote(str(sequence)), out=shlex.quote(str(out)))
     )

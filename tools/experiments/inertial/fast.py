@@ -26,7 +26,7 @@ FRAMES = 350  # of each town
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--towns", type=Path, default=cache_folder())
-    parser.add_argument("--routes", nargs="+", default=["demo", "05"])
+    parser.add_argument("--routes", nargs="*", default=["demo", "05"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[21, 22])
     parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=["vslam"])
     parser.add_argument("--out", type=Path, required=True)

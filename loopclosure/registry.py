@@ -78,7 +78,7 @@ def detector_with_images(
     weights: Path | None = None,
     *,
     local_weights: Path | None = None,
-    late: bool = True,
+    on_demand: bool = True,
 ) -> tuple[LoopDetector, KeyframeImages | None]:
     """Create a loop detector, and the store of keyframe images for verification with learned
     descriptors. Both are empty. :class:`vslam.slam.Slam` takes both.
@@ -88,7 +88,8 @@ def detector_with_images(
             that vslam ships.
         local_weights: weights of the local-descriptor network; None uses the weights that vslam
             ships.
-        late: whether loading of the shipped network is postponed until the first image.
+        on_demand: whether networks are loaded and applied to keyframes only when their descriptors
+            are needed. This saves time, but a frame may have to wait for it.
 
     Returns:
         The detector, and the store of images. The store is None if candidates are verified using
@@ -99,7 +100,10 @@ def detector_with_images(
         ValueError: there is no such detector.
     """
     images = create_images(name, config, local_weights)
-    return create_detector(name, config, weights, images, late=late), images
+    detector = create_detector(name, config, weights, images, on_demand=on_demand)
+    if images is not None and not on_demand:
+        images.network.load()
+    return detector, images
 
 
 def create_detector(
@@ -108,7 +112,7 @@ def create_detector(
     weights: Path | None = None,
     images: KeyframeImages | None = None,
     *,
-    late: bool = False,
+    on_demand: bool = False,
 ) -> LoopDetector:
     """Create an empty loop detector. Its dependencies are imported only when this function is
     called.
@@ -118,7 +122,8 @@ def create_detector(
             that vslam ships.
         images: the store of keyframe images from :func:`create_images`. Pass the same store to
             ``Verifier``.
-        late: whether loading of the shipped network is postponed until the first image.
+        on_demand: whether networks are loaded and applied to keyframes only when their descriptors
+            are needed. This saves time, but a frame may have to wait for it.
 
     Raises:
         InputError: the vocabulary or weights cannot be read, or the package of a plug-in is broken.
@@ -137,13 +142,15 @@ def create_detector(
 
         detectors = [
             create_detector("bow", config),
-            create_detector(_network_of(name), config, weights, images, late=late),
+            create_detector(_network_of(name), config, weights, images, on_demand=on_demand),
         ]
         return CombinedDetector(name, detectors)
     if name in NETWORKS:
         from vslam.loopclosure.siamese.detector import open_detector
 
-        return open_detector(name, config.siamese, weights, config.learned, images, late=late)
+        return open_detector(
+            name, config.siamese, weights, config.learned, images, on_demand=on_demand
+        )
     others = plugins.find_plugins(plugins.DETECTORS)
     if name in others:
         return open_plugin(others[name], config, weights)

@@ -31,10 +31,11 @@ class SiameseDetector:
     """A :class:`vslam.loopclosure.detector.LoopDetector` that compares images using the descriptors
     of a Siamese network.
 
-    If the images of keyframes are stored, descriptors are computed on demand. The network computes
-    the descriptor of a keyframe only when the camera comes within reach of the keyframe
+    If the images of keyframes are stored, descriptors can be computed on demand. The network then
+    computes the descriptor of a keyframe only when the camera comes within reach of the keyframe
     (:func:`beyond_reach`), or when tracking is lost. On a drive that never returns to a place, the
-    network does not run at all.
+    network does not run at all. In real time, this would let a lost frame wait for the descriptors
+    of the whole map, so the descriptors of a keyframe are computed when loops are searched at it.
     """
 
     def __init__(
@@ -43,6 +44,8 @@ class SiameseDetector:
         config: SiameseConfig,
         learned: LearnedMatchingConfig | None = None,
         images: KeyframeImages | None = None,
+        *,
+        on_demand: bool = True,
     ) -> None:
         """Create an empty detector with the name of the network.
 
@@ -53,12 +56,14 @@ class SiameseDetector:
                 descriptors. The reason is that at night, the correct place is often among these
                 keyframes but not ranked first. If it is None, candidates must reach
                 ``config.threshold``.
+            on_demand: whether the descriptors of stored images are computed only when needed.
         """
         self.name = network.name
         self._network = network
         self._learned = learned or LearnedMatchingConfig()
         self._images = images
         self._config = config
+        self._on_demand = on_demand
         self._descriptors = np.zeros((64, 0), np.float32)
         self._n_rows = 0  # number of rows in use
         self._row = np.full(64, -1, np.int64)  # row of each keyframe; -1 if it has no descriptor
@@ -75,6 +80,9 @@ class SiameseDetector:
     def query(self, keyframe: int, map_: Map) -> list[LoopCandidate]:
         if keyframe >= len(self._row) or not (self._described[keyframe] or self._stored(keyframe)):
             return []
+        if self._images is not None and not self._on_demand and keyframe in self._images:
+            self._describe([keyframe])
+            self._images.glance(keyframe)
         eligible = self._searchable(map_)
         eligible[max(0, keyframe - self._config.recent_keyframes) :] = False
         covisible, _ = map_.covisible(keyframe)
@@ -239,7 +247,7 @@ def open_detector(
     learned: LearnedMatchingConfig | None = None,
     images: KeyframeImages | None = None,
     *,
-    late: bool = False,
+    on_demand: bool = False,
 ) -> SiameseDetector:
     """Create a loop detector and load its Siamese network.
 
@@ -247,12 +255,13 @@ def open_detector(
         name: one of ``NETWORKS``.
         weights: ONNX file; None uses the weights that vslam ships.
         config, learned, images: see :class:`SiameseDetector`.
-        late: whether loading of the shipped weights is postponed until the first image.
+        on_demand: whether the shipped weights are loaded at the first image, and the descriptors
+            of stored images are computed when needed.
 
     Raises:
         InputError: the name is unknown, or the weights are missing or belong to a different
             network.
     """
-    late = late and weights is None
+    late = on_demand and weights is None
     network = LateNetwork(name) if late else open_network(name, weights)
-    return SiameseDetector(network, config, learned, images)
+    return SiameseDetector(network, config, learned, images, on_demand=on_demand)

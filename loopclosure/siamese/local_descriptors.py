@@ -26,8 +26,8 @@ _CACHED = 4  # number of descriptor maps in the least-recently-used cache
 
 
 class LocalDescriptors:
-    """Computes local descriptors of images using a network, which is loaded when the first image
-    arrives."""
+    """Computes local descriptors of images using a network, which is loaded by ``load`` or when the
+    first image arrives."""
 
     def __init__(self, path: Path = SHIPPED_LOCAL) -> None:
         """Check that the file of the network exists.
@@ -39,6 +39,14 @@ class LocalDescriptors:
             fix = "install vslam again" if path == SHIPPED_LOCAL else "give another file"
             raise InputError(f"{path}: the weights of the local descriptors are missing; {fix}.")
         self._path = path
+
+    def load(self) -> None:
+        """Load the network.
+
+        Raises:
+            InputError: see ``describe``.
+        """
+        self.describe(np.zeros((96, GLANCE_WIDTH), np.uint8), GLANCE_WIDTH)  # the first use is slow
 
     @cached_property
     def _session(self) -> Any:

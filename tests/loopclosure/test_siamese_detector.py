@@ -191,7 +191,7 @@ def test_a_late_network_is_loaded_by_the_first_image_and_missed_before(monkeypat
         "from vslam.types.features import Features\n"
         "from vslam.loopclosure.registry import create_detector, create_images\n"
         "images = create_images('capsule', Config())\n"
-        "detector = create_detector('capsule', Config(), None, images, late=True)\n"
+        "detector = create_detector('capsule', Config(), None, images, on_demand=True)\n"
         "image = np.zeros((188, 620), np.uint8)\n"
         "detector.add(0, image, Features.none())\n"
         "images.add(0, image)\n"
@@ -330,6 +330,22 @@ def test_the_network_sees_nothing_until_the_camera_may_be_back():
     restored = SiameseDetector(network, config, images=images)
     restored.restore(one.memory())
     assert restored.query(10, map_) == one.query(10, map_)
+
+
+def test_in_real_time_a_lost_frame_waits_only_for_its_own_descriptor():
+    network, images = CountingNetwork(), KeyframeImages(LocalDescriptors())
+    one = SiameseDetector(network, SiameseConfig(), images=images, on_demand=False)
+    later = SiameseDetector(CountingNetwork(), SiameseConfig(), images=images)
+    map_ = driven([50.0 * k for k in range(5)])
+    for keyframe in range(5):
+        for detector in (one, later):
+            detector.add(keyframe, SCENES[keyframe], Features.none())
+        images.add(keyframe, SCENES[keyframe])
+        one.query(keyframe, map_)
+    assert network.seen == 5
+    found = one.locate(SCENES[3], Features.none(), map_)
+    assert network.seen == 5 + 1
+    assert found == later.locate(SCENES[3], Features.none(), map_)
 
 
 @pytest.mark.slow

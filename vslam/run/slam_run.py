@@ -329,10 +329,10 @@ def _create(source: Source, settings: RunOptions, saved: Path | None = None) -> 
     run."""
     config, threads = settings.thresholds, settings.threads
     imu = None if source.imu is None else source.imu.calibration
-    late = not settings.realtime  # in real time, no network may be loaded during the drive
+    on_demand = not settings.realtime  # in real time, no frame may wait for a network
     detector, images = detector_with_images(
         settings.detector, config, settings.weights,
-        local_weights=settings.local_weights, late=late,
+        local_weights=settings.local_weights, on_demand=on_demand,
     )  # fmt: skip
     if saved is not None:
         return Slam.load(

@@ -1,10 +1,10 @@
 """Run ORB-SLAM3 (``pip install pyorbslam3``) on a folder in KITTI's format.
 
-usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--frames N]
+usage: PYTHON orbslam3.py VOCABULARY FOLDER OUT [--frames N] [--paced]
 
 The folder contains the left images in ``image_0``. It may also contain the right images in
-``image_1``, or 16-bit depth images in millimetres in ``depth``. Images of a single camera are
-tracked no faster than the camera took them.
+``image_1``, or 16-bit depth images in millimetres in ``depth``. With ``--paced``, images are
+tracked no faster than the camera took them. Images of a single camera always are.
 
 The costs of the frame loop are written into ``OUT/costs.json``. Waiting is not counted. The script
 imports nothing from vslam, because pyorbslam3 may be installed in another Python environment. The
@@ -65,7 +65,7 @@ _FEATURES = {"stereo": (2000, 12), "mono": (2000, 12), "rgbd": (1000, 20)}
 _SECOND = {"stereo": "image_1", "rgbd": "depth"}  # folder of the second image of a frame
 
 
-def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
+def main(vocabulary: str, folder: Path, out: Path, frames: int | None, paced: bool) -> None:
     """Track the frames of a folder. Write the files that ``vslam_lab.stress.external`` reads.
 
     Args:
@@ -73,6 +73,7 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
         folder: folder in KITTI's format.
         out: output folder.
         frames: number of frames, counted from the first frame; None for all frames.
+        paced: whether images are tracked no faster than the camera took them.
     """
     import pyorbslam3
 
@@ -98,7 +99,7 @@ def main(vocabulary: str, folder: Path, out: Path, frames: int | None) -> None:
     wall, cpu = time.perf_counter(), time.process_time()
     for *paths, t in zip(left, *second, times, strict=True):
         images = [_read(path) for path in paths]
-        if sensor == "mono":
+        if paced or sensor == "mono":
             # Tracking does not wait for mapping. If images arrive faster than from the camera,
             # mapping falls behind, and a monocular run loses track.
             early_s = max(0.0, t - times[0] - (time.perf_counter() - wall))
@@ -218,4 +219,5 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--frames", type=int)
+    parser.add_argument("--paced", action="store_true")
     main(**vars(parser.parse_args()))

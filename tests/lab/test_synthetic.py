@@ -439,7 +439,7 @@ def test_two_processes_do_not_render_one_sequence(tmp_path, monkeypatch, caplog)
             waiting = [
                 pool.submit(store.render_sequence, small, Variation(), tmp_path) for _ in range(2)
             ]
-            while len(caplog.records) < 2:
+            while len(caplog.records) < 2 and not any(each.done() for each in waiting):
                 time.sleep(0.01)
             assert "another process is rendering it; waiting" in caplog.text
             assert fake.calls == 0

@@ -78,6 +78,7 @@ class Slam:
         localize: bool = False,
         resume: bool = False,
         imu: ImuCalibration | None = None,
+        realtime: bool = False,
     ) -> None:
         """Begin SLAM with a new map, or continue in a stored map.
 
@@ -102,6 +103,9 @@ class Slam:
                 ``resumable=True``.
             imu: where the IMU is on the rectified left camera, and its noise. Its samples are
                 passed to ``step`` or ``add_imu``. None if there is no IMU.
+            realtime: load networks now and apply them to every keyframe, so that a lost frame need
+                not wait for this. Otherwise, they are applied only when needed, which takes less
+                time in total. This argument is used only if ``detector`` is a name.
 
         Raises:
             ValueError: the map cannot be continued. The message gives the reason in a few words.
@@ -109,7 +113,7 @@ class Slam:
         """
         config = as_config({} if config is None else config)
         if isinstance(detector, str):
-            detector, images = detector_with_images(detector, config)
+            detector, images = detector_with_images(detector, config, on_demand=not realtime)
         self.context = context = Context.create(camera, config, has_imu=imu is not None)
         self.detector = detector
         self.workers = Workers(threads)
@@ -138,7 +142,8 @@ class Slam:
             detector: the detector with which the map was made, as a name or an object. None uses
                 the detector that is named in the file.
             resume: continue the last drive of the map instead of beginning a new drive.
-            options: ``threads``, ``images`` and ``localize``, as for a new map.
+            options: ``threads``, ``images``, ``localize``, ``imu`` and ``realtime``, as for a new
+                map.
 
         Raises:
             InputError: the file is not a map or is damaged, the map was made with another detector

@@ -158,8 +158,8 @@ class SlamNode(Node):
     def begin(self, camera: Camera, left: CameraInfo) -> Slam:
         imu = None if self.imu is None else self.imu.calibration(left)
         if not self.first_map:
-            return Slam(camera, detector=self.detector, imu=imu)
-        slam = Slam.load(self.first_map, localize=self.localize, imu=imu)
+            return Slam(camera, detector=self.detector, imu=imu, realtime=True)
+        slam = Slam.load(self.first_map, localize=self.localize, imu=imu, realtime=True)
         if slam.context.camera != camera:
             raise ValueError(
                 f"{self.first_map} was made with another camera: {slam.context.camera}"

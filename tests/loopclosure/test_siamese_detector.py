@@ -29,6 +29,7 @@ from vslam.loopclosure.siamese.local_descriptors import KeyframeImages, LocalDes
 from vslam.loopclosure.siamese.weights import SHIPPED
 from vslam.loopclosure.verifier import Verifier
 from vslam.method.closing import LoopClosing
+from vslam.slam import Slam
 from vslam.support.errors import InputError, ResultsError
 from vslam.types.camera import Camera
 from vslam.types.context import Context
@@ -498,6 +499,18 @@ def test_the_paper_s_detector_compares_with_all_keyframes_and_verifies_by_orb():
     assert best.match == 0
     assert best.score >= config.siamese.threshold == 0.9
     assert {edge.matched_by for edge in closing.edges} == {"orb"}
+
+
+@pytest.mark.parametrize("realtime", [True, False])
+def test_in_real_time_a_keyframe_is_described_when_it_is_made(realtime):
+    slam = Slam(Camera(400.0, 400.0, 310.0, 94.0, 0.5, 620, 188), {}, "capsule", realtime=realtime)
+    map_ = driven([50.0 * k for k in range(3)])
+    closing = slam._session.closing
+    for keyframe in range(3):
+        closing.process(map_, keyframe, features(100), WALLS[keyframe])
+    stored = [keyframe for keyframe in range(3) if keyframe in closing.verifier.images]
+    described = slam.detector.memory().tables["descriptors"]
+    assert np.flatnonzero(np.diff(described.first)).tolist() == (stored if realtime else [])
 
 
 def graph_of(
